@@ -18,7 +18,7 @@ from puncture_twin.planning.case.entry import entry_frame, grid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
+from puncture_twin.planning.search.candidates import ArmColumns, Candidates, ClearanceColumns, Path, Ranking, Verdict
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.raster.raster import draw
 from puncture_twin.twin.report.raster.render import Drawn, View
@@ -99,10 +99,10 @@ def make_candidates(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360),
             skin_angle=np.zeros(n),
             tissue=np.zeros(n),
         ),
-        clearance=Clearance(
+        clearance=ClearanceColumns(
             structures=("rib_right_9", "aorta"),
             margins=np.array([1.0, 5.0]),
-            distance=clearance,
+            by_structure=clearance,
             least=clearance.min(axis=1),
         ),
         arm=ArmColumns(np.where(good, 1, -1).astype(np.int8), np.where(good, 0.5, np.nan), np.full((n, 6), np.nan)),

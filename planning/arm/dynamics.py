@@ -38,19 +38,14 @@ N_PARAMETERS = 78
 
 SAME = 1e-9
 """Of the largest diagonal of R: below it a column depends on the others; the least that does not is above 1e-3."""
-
 SLOW = 0.02
 """rad/s: below it nobody knows which way friction works, and the joint's equation is passed over."""
-
 SMOOTHED_S = 0.2
 """Span of the quintics whose slopes are speed and acceleration; the exciting motion's fastest part takes 4 s."""
-
 MOST_CONDITION = 1e4
 """Largest over least singular value of the base regressor, its columns of length 1: beyond, a parameter is open."""
-
 MOST_LEFT = 0.5
 """Of the torques, each joint's in units of what its motor can give: if more is left, they belong to another motion."""
-
 MOST_BYTES, MOST_ROWS, MOST_UNEVEN = 50_000_000, 50_000, 1.1
 COLUMNS = "time_s, q1_deg .. q6_deg, tau1_nm .. tau6_nm (or RTDE's timestamp, actual_q_0 .., target_moment_0 ..)"
 
@@ -59,10 +54,8 @@ class TorqueRecording(NamedTuple):
     """Rows of a recording, in even steps of time."""
 
     step_s: float
-    q: Floats
-    """Shape (n, 6), rad."""
-    torque_nm: Floats
-    """Shape (n, 6)."""
+    q: Floats  # shape (n, 6), rad
+    torque_nm: Floats  # shape (n, 6)
 
 
 class JointMotion(NamedTuple):
@@ -117,10 +110,8 @@ def _inertia(w: Floats) -> Floats:
 class BaseParameters:
     """What torques can show of an arm's parameters: Y phi = Y[:, columns] K phi, whatever the motion."""
 
-    columns: Ints
-    """Shape (r,), of phi."""
-    K: Floats
-    """Shape (r, 78)."""
+    columns: Ints  # shape (r,), of phi
+    K: Floats  # shape (r, 78)
 
 
 def base_parameters(model: UrModel, down_base: Floats, seed: int = 0) -> BaseParameters:
@@ -140,21 +131,14 @@ class Identified(Shown):
     """What a recording says of an arm's dynamics."""
 
     base: BaseParameters
-    values: Floats
-    """Shape (r,), of the base parameters, kg, m, N m, s, rad."""
-    covariance: Floats
-    """Shape (r, r)."""
-    torque_sd_nm: Floats
-    """Shape (6,), of a torque about the model."""
+    values: Floats  # shape (r,), of the base parameters, kg, m, N m, s, rad
+    covariance: Floats  # shape (r, r)
+    torque_sd_nm: Floats  # shape (6,), of a torque about the model
     rows: int
-    freedom: int
-    """Equations less parameters."""
-    condition: float
-    """Of the equations, columns of length 1."""
-    unexplained: float
-    """What is left of the torques, rms, of the torques themselves."""
-    correlated: Floats
-    """Shape (6,), from one row to the next, of what is left."""
+    freedom: int  # equations less parameters
+    condition: float  # of the equations, columns of length 1
+    unexplained: float  # what is left of the torques, rms, of the torques themselves
+    correlated: Floats  # shape (6,), from one row to the next, of what is left
 
     def _facts(self) -> Facts:
         yield "rows", f"{self.rows:,}"
@@ -221,8 +205,7 @@ def identify(
 ) -> Identified:
     """Base parameters by least squares, every joint weighed by what it leaves.
 
-    Args:
-        down_base: Shape (3,), unit vector of gravity, base frame.
+    Gravity is along ``down_base`` (3,), a unit vector of the base frame.
 
     Raises:
         InputError: The motion leaves a parameter open, or the torques do not belong to it.

@@ -20,12 +20,9 @@ from puncture_twin.planning.base.numba_kernels import allocation_free
 class NeedleLine(NamedTuple):
     """A line to insert along, base frame."""
 
-    R_base_flange: Floats
-    """Shape (3, 3): the flange's axes at roll 0."""
-    target: Floats
-    """Shape (3,), mm."""
-    outward: Floats
-    """Shape (3,), unit."""
+    R_base_flange: Floats  # shape (3, 3): the flange's axes at roll 0
+    target: Floats  # shape (3,), mm
+    outward: Floats  # shape (3,), unit
 
 
 def needle_lines(targets_base: Floats, outwards_base: Floats) -> list[NeedleLine]:
@@ -70,7 +67,6 @@ def flange_poses(
 
 MAX_JOINT_STEP_RAD_PER_MM = 0.05
 """A joint that turns more per mm of insertion jumps: at 10 mm/s it would run at 0.5 rad/s."""
-
 FULL_MARGIN_RAD = math.pi / 2
 """A joint this far or farther from its limits has the full margin of 1."""
 
@@ -85,9 +81,7 @@ class InsertionStop(NamedTuple):
 def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop | None:
     """First sample at which a path is not feasible: out of reach, singular, or a joint jumps; None if none.
 
-    Args:
-        path: Shape (m, 6), rad, one branch of `every_branch`.
-        depths_mm: Shape (m,), rising, mm.
+    Of one branch (m, 6), rad, at rising depths (m,), mm.
     """
     at = _first_stop_at(model.lengths, path, depths_mm, MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM)
     if at < 0:
@@ -117,13 +111,9 @@ def _first_stop_at(lengths, path, depths, at_least, fastest):  # type: ignore[no
 
 
 def reach_margin(model: UrModel, q: Floats) -> float:
-    """Margin of a motion: least of each joint's distance to its limits over a quarter turn, and the singularity terms.
+    """Margin of a motion (m, 6), rad, 0..1 within the limits.
 
-    Args:
-        q: Shape (m, 6), rad.
-
-    Returns:
-        0..1 for motions within the limits.
+    The least of each joint's distance to its limits over a quarter turn, and of the singularity terms.
     """
     return float(_path_margin(model.lengths, model.joint_limits, FULL_MARGIN_RAD, q))
 

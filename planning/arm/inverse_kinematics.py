@@ -18,17 +18,13 @@ from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 
 N_BRANCHES = 8
 """Shoulder left or right, times wrist flipped or not, times elbow up or down, in this order of weight 4, 2, 1."""
-
 EVERY_BRANCH = (1 << N_BRANCHES) - 1
 """A bit for each of them."""
-
 BOUNDARY_TOLERANCE = 1e-12
 """How far a cosine may exceed 1 and still count as the stretched pose: rounding of its few products, which moves
 the flange by less than 1e-9 mm."""
-
 WRIST_FREE = 1e-12
 """Below this |sin q5| axes 4 and 6 are one within rounding: q6 is free, and 0 is taken."""
-
 TURN = 2.0 * math.pi
 
 
@@ -164,18 +160,12 @@ def wrap_to_pi(angle: Floats) -> Floats:
 def nearest_within_limits(model: UrModel, q: Floats, q_reference: Floats) -> Floats:
     """The whole turns added to each joint that bring it nearest to a reference without leaving its limits.
 
-    Args:
-        q: Shape (..., 6), rad.
-        q_reference: Broadcasts against ``q``, rad.
-
-    Returns:
-        Shape (..., 6), rad; NaN in all six joints where some joint has no such turn.
+    Of joints (..., 6), rad, and so is the result; NaN in all six where some joint has no such turn.
     """
-    turn = 2.0 * np.pi
     low, high = model.joint_limits[:, 0], model.joint_limits[:, 1]
-    fewest, most = np.ceil((low - q) / turn), np.floor((high - q) / turn)
-    turns = np.clip(np.round((q_reference - q) / turn), fewest, most)
-    wrapped = np.where(fewest <= most, np.clip(q + turn * turns, low, high), np.nan)  # the sum may round beyond
+    fewest, most = np.ceil((low - q) / TURN), np.floor((high - q) / TURN)
+    turns = np.clip(np.round((q_reference - q) / TURN), fewest, most)
+    wrapped = np.where(fewest <= most, np.clip(q + TURN * turns, low, high), np.nan)  # the sum may round beyond
     wrapped[np.isnan(wrapped).any(axis=-1)] = np.nan
     return wrapped
 
@@ -183,12 +173,10 @@ def nearest_within_limits(model: UrModel, q: Floats, q_reference: Floats) -> Flo
 def wrapped_solutions(model: UrModel, q: Floats) -> Floats:
     """Every configuration within the limits that differs from one by whole turns; ``q`` (6,), rad, finite.
 
-    Returns:
-        Shape (n, 6), rad; empty when some joint has none.
+    Shape (n, 6), rad; empty when some joint has none.
     """
-    turn = 2.0 * np.pi
     choices = []
     for angle, (low, high) in zip(q, model.joint_limits, strict=True):
-        turns = np.arange(math.ceil((low - angle) / turn), math.floor((high - angle) / turn) + 1)
-        choices.append(np.clip(angle + turn * turns, low, high))  # the sum may round beyond
+        turns = np.arange(math.ceil((low - angle) / TURN), math.floor((high - angle) / TURN) + 1)
+        choices.append(np.clip(angle + TURN * turns, low, high))  # the sum may round beyond
     return np.stack(np.meshgrid(*choices, indexing="ij"), axis=-1).reshape(-1, 6)

@@ -117,7 +117,6 @@ PARAMETERS: Mapping[str, slice] = MappingProxyType(
     }
 )
 """Which columns belong to which kind: a1..a6 and d1, d3..d6; alpha1..6; zeros q1..6; flange axes; flange x and y."""
-
 FREE_D = (0, 2, 3, 4, 5)
 """Indices of the link offsets that are parameters."""
 
@@ -175,8 +174,7 @@ class ErringArm(NamedTuple):
     a: Floats
     d: Floats
     alpha: Floats
-    zeros: Floats
-    """True zero minus nominal zero of each joint."""
+    zeros: Floats  # true zero minus nominal zero of each joint
 
     def link_poses(self, q: Floats) -> Floats:
         """T_base_link, shape (..., 7, 4, 4), mm, of configurations (..., 6), rad: base first, flange last."""
@@ -211,13 +209,10 @@ def dh_step(q: Floats, d: Floats | float, a: Floats | float, alpha: Floats | flo
 MIN_SINGULARITY = 0.05
 """Each term of :class:`Singularity` must exceed this over the whole insertion. For the wrist
 that is 2.9 deg; joint speeds there are up to 20 times those of the best pose, and worse below."""
-
 TIE_DIGITS = 9
 """Distances from singular that agree to so many digits are equal: mirrored branches and rolls are, but for rounding."""
-
 ELBOW = 2
 """The row of `link_poses` whose origin is the elbow: where the upper arm ends."""
-
 ELBOW_DIGITS = 6
 """Decimals of the elbow's place, mm: it does not move with the roll."""
 
@@ -225,12 +220,9 @@ ELBOW_DIGITS = 6
 class Singularity(NamedTuple):
     """Distance of a configuration from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
 
-    shoulder: Floats
-    """In-plane distance of the wrist centre from axis 1, over the longest possible."""
-    elbow: Floats
-    """|sin q3|."""
-    wrist: Floats
-    """|sin q5|."""
+    shoulder: Floats  # in-plane distance of the wrist centre from axis 1, over the longest possible
+    elbow: Floats  # |sin q3|
+    wrist: Floats  # |sin q5|
 
     def least(self) -> Floats:
         """The smallest of the three, shape (...)."""
@@ -243,15 +235,12 @@ class Singularity(NamedTuple):
 
 
 def singularity(model: UrModel, q: Floats) -> Singularity:
-    """Distance from the three singularities.
+    """Distance of configurations (..., 6), rad, from the three singularities.
 
     The Jacobian's determinant is, up to sign and constant lengths, the product of sin q3, sin q5 and the shoulder
     term a2 cos q2 + a3 cos q23 + d5 sin q234 (tests hold this).
-
-    Args:
-        q: Shape (..., 6), rad.
     """
-    rows = np.array(q, dtype=np.float64, order="C").reshape(-1, 6)  # a copy: read-only ones would be compiled for too
+    rows = _rows(q)
     terms = np.empty((3, len(rows)))
     _singularities(model.lengths, rows, terms)
     return Singularity(*terms.reshape(3, *np.shape(q)[:-1]))
@@ -321,7 +310,6 @@ class SpeedLimits(NamedTuple):
 
 DEFAULT_SPEEDS = SpeedLimits()
 """Speeds where none are stated."""
-
 HIGHEST = SpeedLimits(1000.0, 100.0, 1.0, 1.0)
 """The highest speeds that a case may state: a UR's usual tool speed, a needle that is pushed briskly, and all that the
 joints can."""
@@ -339,22 +327,16 @@ def slowed(model: UrModel, speeds: SpeedLimits) -> UrModel:
 class TipLimit(NamedTuple):
     """The highest speed of a point on the flange's z axis."""
 
-    tip_mm: float
-    """Flange to tip."""
+    tip_mm: float  # flange to tip
 
     speed_mm_s: float
 
 
 def tip_rates(model: UrModel, q: Floats, directions: Floats, tip_mm: float) -> Floats:
-    """How fast the tip moves while the joints move at given speeds: |J_v u + (J_w u) x l z|, l from flange to tip.
+    """How fast the tip moves while the joints move at given speeds: |J_v u + (J_w u) x l z|, shape (m,), mm/s.
 
-    Args:
-        q: Shape (m, 6), rad.
-        directions: Shape (m, 6) or (6,), u: joint speeds, rad/s; or per whatever else the tip's speed is then per.
-        tip_mm: Flange to tip, along the flange's z.
-
-    Returns:
-        Shape (m,), mm/s.
+    At joints ``q`` (m, 6), rad. u is ``directions``, (m, 6) or (6,), rad/s, or per whatever else the tip's speed is
+    then per; l is ``tip_mm``, from flange to tip along the flange's z.
     """
     twists = np.einsum("mij,mj->mi", jacobian(model, q), np.broadcast_to(directions, q.shape))
     lever = tip_mm * flange_pose(model, q)[:, :3, 2]
@@ -362,16 +344,7 @@ def tip_rates(model: UrModel, q: Floats, directions: Floats, tip_mm: float) -> F
 
 
 def tip_speeds(model: UrModel, q: Floats, times_s: Floats, tip_mm: float) -> Floats:
-    """The tip's mean speed between the samples of a motion, mm/s.
-
-    Args:
-        q: Shape (m, 6), rad.
-        times_s: Shape (m,), s, rising.
-        tip_mm: Flange to tip, along the flange's z.
-
-    Returns:
-        Shape (m - 1,).
-    """
+    """The tip's mean speed between the samples of a motion ``q`` (m, 6), rad, at rising times: shape (m - 1,), mm/s."""
     poses = flange_pose(model, q)
     tips = poses[:, :3, 3] + tip_mm * poses[:, :3, 2]
     return np.asarray(np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(times_s))
@@ -379,10 +352,8 @@ def tip_speeds(model: UrModel, q: Floats, times_s: Floats, tip_mm: float) -> Flo
 
 MOST_OFF_MM = 5.0
 """A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
-
 FITS_MM = 1.5
 """Another model whose joints put the tool so near to where it was is the arm that was recorded."""
-
 LEVER_MM = 95.0
 """A flange's axes are compared with joints by points so far out: 3 degrees move them by 5 mm."""
 
@@ -399,9 +370,8 @@ def check_arm(
 ) -> None:
     """Refuse joints of another arm: ones that do not put the tool where the same file says that it was.
 
-    A UR3e's joints read as a UR3's are 18 mm off, and six angles alone do not show it. But a recording often states the
-    same thing twice: a controller's own pose with its joints, a touched point, a flange. With the arm's nominal lengths
-    both must agree, up to what a controller's own calibration moves.
+    A UR3e's joints read as a UR3's are 18 mm off, and six angles alone do not show it. Where a recording states a point
+    besides them, both must agree with the arm's nominal lengths, up to what a controller's own calibration moves.
 
     Args:
         q: Shape (n, 6), rad.
@@ -419,15 +389,13 @@ def check_arm(
         tools = [*tools_flange] if known else [np.median(np.einsum("nji,nj->ni", R, gaps), axis=0)]
         return min((np.linalg.norm(R @ tool - gaps, axis=1) for tool in tools), key=lambda misses: float(misses.max()))
 
-    own = off(model, True)
-    if own.max() <= MOST_OFF_MM:
-        return
-    likely = [one.name for one in UR_MODELS.values() if one != model and off(one, True).max() <= FITS_MM]
-    if any_tool and not likely:
-        own = off(model, False)
+    for known in (True, False) if any_tool else (True,):
+        own = off(model, known)
         if own.max() <= MOST_OFF_MM:
             return
-        likely = [one.name for one in UR_MODELS.values() if one != model and off(one, False).max() <= FITS_MM]
+        likely = [one.name for one in UR_MODELS.values() if one != model and off(one, known).max() <= FITS_MM]
+        if likely:
+            break
     row = int(np.argmax(own))
     arm = f"; those of a {' or '.join(likely)} do not" if likely else ""
     what = f"the joints of {names[row]} put the tool of a {model.name} {own[row]:.1f} mm from where it was{arm}"
@@ -438,8 +406,7 @@ def check_arm(
 def check_recording(model: UrModel, tip_mm: float, recording: JointRecording, *, where: str | Path) -> None:
     """Refuse a recording whose controller had its tool where this arm's joints do not put one; without a tool, nothing.
 
-    Args:
-        recording: Joints, and where the controller had its tool: flange, tip, or another point that all rows share.
+    The tool may be the flange, the tip, or another point that all rows share.
     """
     if recording.tool_base is None:
         return

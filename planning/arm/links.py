@@ -28,28 +28,20 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, joined, packed_me
 
 LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 """The arm's seven bodies, as their links' names in a UR's URDF without ``_link``; index = frame of ``link_poses``."""
-
-
 SLABS: Mapping[str, int] = MappingProxyType({"base": 3, "upper_arm": 3, "forearm": 4})
 """Into how many slabs along its longest side a link is cut before the hulls are taken; the others stay whole.
 
 One hull of the whole forearm bulges over the wrist and touches wrist 2 in 21 % of random configurations of a UR3 where
 the mesh itself never does; with these slabs 73.3 % of them are free against 73.8 % for the open meshes themselves.
 """
-
-
 PIN_RADIUS_MM, PIN_SIDES = 10.0, 8
 """Radius of the pin that replaces a joint where the meshes leave a gap: well inside every link."""
-
 FLUSH_MM = 1e-4
 """Overlap along their joint's axis below which two meshes end in one plane: whether they touch is rounding."""
-
 FLAT_MM = 0.05
 """Points that lie within such a sheet span no body: their hull would be one of rounding."""
-
 MOST_GAP_MM = 5.0
 """Gap between an own URDF's shapes, at most: the UR5's meshes leave 3 mm, and a mesh in another unit hundreds."""
-
 PIN_ROOT_MM = 5.0
 """How far such a pin reaches into the links at both sides."""
 
@@ -58,12 +50,9 @@ PIN_ROOT_MM = 5.0
 class Link:
     """One body of the arm."""
 
-    name: str
-    """One of ``LINK_NAMES``."""
-    frame: int
-    """Index into the poses of ``link_poses``."""
-    pieces: tuple[TriangleMesh, ...]
-    """Meshes in that frame, mm; their union is the body."""
+    name: str  # one of ``LINK_NAMES``
+    frame: int  # index into the poses of ``link_poses``
+    pieces: tuple[TriangleMesh, ...]  # meshes in that frame, mm; their union is the body
 
     @cached_property
     def mesh(self) -> TriangleMesh:
@@ -111,8 +100,7 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
 def visual_links(model: UrModel) -> tuple[Link, ...]:
     """The links in full detail, for images: same frames as :func:`collision_links`.
 
-    They are the collision shapes themselves (43,000 triangles for the UR3), from the URDF's link frames to ours: a
-    constant motion each. Reading coloured Collada files would need one more package.
+    They are the collision shapes themselves (43,000 triangles for the UR3): Collada files would need one more package.
     """
     urdf = model_urdf(model)
     T_link_urdflink = np.linalg.inv(link_poses(model, np.zeros(6))) @ urdf.body_poses(np.zeros(6))
@@ -131,13 +119,9 @@ def _pieces(mesh: TriangleMesh, name: str, model: UrModel) -> tuple[TriangleMesh
 
 
 def convex_pieces(mesh: TriangleMesh, count: int) -> tuple[TriangleMesh, ...]:
-    """The hulls of the surface's parts in equal slabs across the longest side. Their union contains the surface.
+    """The hulls of the surface's parts in ``count`` equal slabs across the longest side; they contain the surface.
 
-    Args:
-        count: Slabs; one hull of all is made where a slab's part of the surface is flat.
-
-    Returns:
-        Nothing where the whole surface is flat.
+    One hull of all where a slab's part of the surface is flat, none where the whole is.
     """
     low, high = mesh.bounds
     axis = int(np.argmax(high - low))
@@ -199,20 +183,14 @@ def plane_crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floa
 
 SHAPES = "ur"
 """Where URDFs and shapes lie below our meshes, and how the URDFs' addresses begin."""
-
 T_BASE_URDFBASE = np.diag([-1.0, -1.0, 1.0, 1.0])
 """A UR's URDF has its ``base_link`` against the controller's base: half a turn about z."""
-
 MEANS = "://"
 """What an address has that is more than a path."""
 
 
 def model_urdf(model: UrModel) -> ArmUrdf:
-    """The URDF of a model, with its shapes.
-
-    Raises:
-        InputError: Nobody has the shapes of such a model.
-    """
+    """The URDF of a model, with its shapes. Raises InputError: Nobody has the shapes of such a model."""
     if model.urdf is not None:
         return model.urdf
     if not model.shipped:

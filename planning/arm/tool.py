@@ -23,22 +23,15 @@ SLABS = 6
 class ToolBody:
     """A rigid body that is bolted to the flange."""
 
-    mesh: TriangleMesh
-    """Its surface, mm, in the flange's frame."""
+    mesh: TriangleMesh  # its surface, mm, in the flange's frame
     file: Path
-    unit_mm: float
-    """How many millimetres one unit of the file is."""
-    T_flange_file: Floats
-    """Shape (4, 4), mm: the file's frame in the flange's."""
+    unit_mm: float  # how many millimetres one unit of the file is
+    T_flange_file: Floats  # shape (4, 4), mm: the file's frame in the flange's
     key: str
 
     @cached_property
     def pieces(self) -> tuple[TriangleMesh, ...]:
-        """Convex pieces that together contain it: open or turned inside out, it is the same body.
-
-        Raises:
-            InputError: It is flat.
-        """
+        """Convex pieces that together contain it, open or turned inside out. Raises InputError: It is flat."""
         pieces = convex_pieces(self.mesh, SLABS)
         if not pieces:
             refuse("the mesh is flat", self.key, "a body, not a sheet", "flat_mesh")
@@ -54,7 +47,6 @@ class ToolBody:
 HOLDER_ROOT_MM = 5.0
 """How far the holder's body reaches back into wrist 3, whose mesh ends up to 1.4 mm before the flange plane: without
 an overlap a flat surface could pass between the two unseen."""
-
 NEEDLE_ROOT_MM = 1.0
 """How far the needle's body reaches back into the holder, for the same reason."""
 
@@ -64,12 +56,10 @@ class Tool:
     """Needle and holder. The holder is a cylinder from the flange along +z; the needle goes on from it to the tip."""
 
     needle_length_mm: float
-    shaft_mm: float
-    """Usable length: from the holder's end to the tip."""
+    shaft_mm: float  # usable length: from the holder's end to the tip
     needle_diameter_mm: float
     holder_diameter_mm: float
-    body: ToolBody | None = None
-    """What the flange carries besides them, or None."""
+    body: ToolBody | None = None  # what the flange carries besides them, or None
 
     @property
     def holder_length_mm(self) -> float:
@@ -92,10 +82,8 @@ class Box:
     """A solid cuboid in the workcell, such as the table."""
 
     name: str
-    T_base_box: Floats
-    """Shape (4, 4), mm: the box's centre and axes in the base frame."""
-    size_mm: tuple[float, float, float]
-    """Full edge lengths along its axes."""
+    T_base_box: Floats  # shape (4, 4), mm: the box's centre and axes in the base frame
+    size_mm: tuple[float, float, float]  # full edge lengths along its axes
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_base_box", read_only(self.T_base_box))

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
+from puncture_twin.planning.base.arrays import read_only
 from puncture_twin.planning.base.errors import refuse
 
 ELBOW = 2
 """Index of the elbow among the six joints."""
-
 JOINT_NAMES = (
     "shoulder_pan_joint",
     "shoulder_lift_joint",
@@ -31,7 +31,6 @@ JOINT_NAMES = (
     "wrist_3_joint",
 )
 """The joints as a UR's URDF (and ROS) names them."""
-
 DEFAULT_MAX_ACCELERATION = 1.4
 """rad/s^2: what the controller itself takes for a joint move when the program names none (URScript ``movej``)."""
 
@@ -40,39 +39,25 @@ DEFAULT_MAX_ACCELERATION = 1.4
 class UrModel:
     """One arm of the family. Lengths in mm, angles in rad."""
 
-    name: str
-    """Such as ``ur3``."""
-    d1: float
-    """Height of the shoulder axis above the base, mm."""
-    a2: float
-    """Upper arm, mm, negative as in the DH table."""
-    a3: float
-    """Forearm, mm, negative as in the DH table."""
-    d4: float
-    """Sideways offset of the wrist, mm."""
-    d5: float
-    """From wrist 1 to wrist 2, mm."""
-    d6: float
-    """From wrist 2 to the flange, mm."""
-    joint_limits: NDArray[np.float64]
-    """Shape (6, 2), rad: lowest and highest angle of each joint."""
-    max_speeds: NDArray[np.float64]
-    """Shape (6,), rad/s."""
-    max_torques: NDArray[np.float64]
-    """Shape (6,), N m: what each joint's motor can give."""
-    max_acceleration: float = DEFAULT_MAX_ACCELERATION
-    """rad/s^2, for every joint."""
+    name: str  # such as ``ur3``
+    d1: float  # height of the shoulder axis above the base, mm
+    a2: float  # upper arm, mm, negative as in the DH table
+    a3: float  # forearm, mm, negative as in the DH table
+    d4: float  # sideways offset of the wrist, mm
+    d5: float  # from wrist 1 to wrist 2, mm
+    d6: float  # from wrist 2 to the flange, mm
+    joint_limits: NDArray[np.float64]  # shape (6, 2), rad: lowest and highest angle of each joint
+    max_speeds: NDArray[np.float64]  # shape (6,), rad/s
+    max_torques: NDArray[np.float64]  # shape (6,), N m: what each joint's motor can give
+    max_acceleration: float = DEFAULT_MAX_ACCELERATION  # rad/s^2, for every joint
     joint_names: tuple[str, ...] = JOINT_NAMES
-    shipped: bool = True
-    """Whether its shapes are those that ship under its name."""
+    shipped: bool = True  # whether its shapes are those that ship under its name
     urdf: ArmUrdf | None = None
     """Its own URDF, if it has one; an arm that neither ships nor has one is known by its numbers alone."""
 
     def __post_init__(self) -> None:
         for name in ("joint_limits", "max_speeds", "max_torques"):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @cached_property
     def digest(self) -> str:
@@ -105,9 +90,7 @@ class UrModel:
     @cached_property
     def lengths(self) -> NDArray[np.float64]:
         """(d1, a2, a3, d4, d5, d6), shape (6,), mm: the arm as compiled code takes it."""
-        lengths = np.array([self.d1, self.a2, self.a3, self.d4, self.d5, self.d6])
-        lengths.setflags(write=False)
-        return lengths
+        return read_only([self.d1, self.a2, self.a3, self.d4, self.d5, self.d6])
 
     @property
     def shoulder_base(self) -> NDArray[np.float64]:
@@ -115,14 +98,7 @@ class UrModel:
         return np.array([0.0, 0.0, self.d1])
 
     def within_limits(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether each configuration keeps every joint within its limits.
-
-        Args:
-            q: Shape (..., 6), rad. NaN is outside.
-
-        Returns:
-            Shape (...).
-        """
+        """Whether configurations (..., 6), rad, keep every joint within its limits, shape (...); NaN is outside."""
         return np.asarray(np.all((q >= self.joint_limits[:, 0]) & (q <= self.joint_limits[:, 1]), axis=-1))
 
 
@@ -145,7 +121,6 @@ _WEAK = (56.0, 56.0, 28.0, 12.0, 12.0, 12.0)
 _STRONG = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
 _STRONGEST = (330.0, 330.0, 150.0, 56.0, 56.0, 56.0)
 """The manufacturer's joint torques; the URDF of the UR3 carries those of a UR10. The e-Series': of its URDFs."""
-
 UR_MODELS: Mapping[str, UrModel] = MappingProxyType(
     {
         model.name: model
@@ -163,14 +138,7 @@ UR_MODELS: Mapping[str, UrModel] = MappingProxyType(
 
 
 def ur_model(name: str) -> UrModel:
-    """The model of that name.
-
-    Args:
-        name: Such as ``ur3``; upper case is accepted.
-
-    Raises:
-        InputError: If no such model is known.
-    """
+    """The model of a name such as ``ur3``, in upper or lower case. Raises InputError: No such model is known."""
     model = UR_MODELS.get(name.lower())
     if model is None:
         refuse(f"unknown robot model {name!r}", "robot model", ", ".join(UR_MODELS), "unknown_robot")

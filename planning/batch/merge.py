@@ -116,7 +116,7 @@ def searched_row(planned: PlannedCase, context: CaseContext, candidates: Candida
     safe, counts = int(candidates.safe.sum()), candidates.counts()
     most = f" (most: {next(iter(counts))})" if counts else ""  # the reason of most directions, where none is safe
     row = blank_row(planned, 0 if safe else 1, None if safe else f"{NO_SAFE}{most}")
-    row |= {"directions": len(candidates), "safe": safe, "arm": context.arm, "reach_fraction": _reach(candidates)}
+    row |= {"directions": len(candidates), "safe": safe, "arm": context.arm_note, "reach_fraction": _reach(candidates)}
     windows = candidates.windows
     row |= {"windows": len(windows), "safe_square_deg": sum(one.square_deg for one in windows)}
     row |= {"safe_entry_cm2": sum(one.entry_cm2 for one in windows)}

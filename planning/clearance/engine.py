@@ -80,7 +80,6 @@ class ClearanceEngine(Protocol):
 
 NEAR_THRESHOLD_MM = 1e-4
 """Within this of a margin FCL's capsule collision decides: its own tolerance is 1e-6 mm."""
-
 ROUNDING_MM = 1e-9
 """An axis that is too near by more than this is too close even where FCL does not see it: a capsule that overlaps a
 triangle by less than 1e-6 mm is free to FCL."""
@@ -116,7 +115,7 @@ def too_near(
 
 
 @dataclass(frozen=True, eq=False)
-class Clearances:
+class MeasuredClearances:
     """Clearances of n candidates from k structures; mm."""
 
     clearance: Floats
@@ -136,7 +135,7 @@ def measure_clearances(
     length: Floats | float,
     radius: float,
     axes: AxisDistances | None = None,
-) -> Clearances:
+) -> MeasuredClearances:
     """Clearance of n candidates from k structures, and whether it violates each margin.
 
         clearance = distance of the axis from the surface - needle radius;  violated: clearance < margin
@@ -166,7 +165,7 @@ def measure_clearances(
                 engine, column, target_ct, outward_ct, lengths[:, column], distance[:, column], limit
             )
     distance -= radius
-    return Clearances(distance, depth, violated)
+    return MeasuredClearances(distance, depth, violated)
 
 
 def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
@@ -190,16 +189,7 @@ def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Float
 
 @nb.njit(cache=True)
 def axis_normals(triangles, nearest, distance, depth, target, outward, normal):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``normal`` (n, 3) with the unit vectors of one surface: see `normals_of`; NaN on contact.
-
-    Args:
-        triangles: Shape (m, 9), corners in rows, mm.
-        nearest: Shape (n,), row of each axis' nearest triangle.
-        distance: Shape (n,), mm.
-        depth: Shape (n,), of the nearest axis point, mm.
-        target: Shape (3,), where the axes start, mm.
-        outward: Shape (n, 3), unit vectors.
-    """
+    """Fill ``normal`` (n, 3) with the unit vectors of one surface (m, 9); NaN on contact: see `normals_of`."""
     for i in range(len(outward)):
         if distance[i] <= 0.0:
             normal[i] = math.nan

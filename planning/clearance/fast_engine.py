@@ -25,32 +25,29 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
+from puncture_twin.planning.clearance.kernels.bundle_search import ROUNDED_UP
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.segment_triangle import (
+    axis_triangle,
     blocks_near,
     displaced_distances,
-    nearest_triangle,
     spheres_around,
 )
 from puncture_twin.planning.clearance.kernels.side_by_side import SearchOutput
-from puncture_twin.planning.clearance.kernels.surface_search import COUNTED, scratch_for, search_bundles
+from puncture_twin.planning.clearance.kernels.surface_search import COUNTED, STACK, scratch_for, search_bundles
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 FCL_BEYOND_MM = 1.0
 """Farther from a capsule FCL sees nothing: its tolerance is 1e-6 mm, and the bounds' rounding 1e-5 mm."""
-
 MOST_THREADS = 16
 """Threads at most: more were never tried."""
-
 PIECE_TRIANGLES = 20_000
 """A structure is searched in two pieces and one more for every so many triangles, each with a part of the directions,
 so that no thread waits long for another at the end: a small one close to the target takes as long as a large one. The
 pieces do not depend on the number of threads: they may decide which of equally near triangles is named."""
-
 WORTH_THREADS = 20_000
 """Answers, or triangles to pack: a few milliseconds of work. Below, starting threads takes as long."""
-
 LONGEST_MM = 1e9
 """Longest axis that is measured: a longer one could reach the empty nodes that fill up a level of the tree
 (`blocks.FAR_MM`)."""
@@ -59,7 +56,7 @@ LONGEST_MM = 1e9
 class FastEngine:
     """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
 
-    Answers what `FclEngine` answers, to rounding of float64. Surfaces are packed when it is first asked, once for all
+    Answers what `FclEngine` answers, to rounding of float64. Surfaces are packed at its first query, once for all
     targets.
 
     Args:
@@ -215,14 +212,11 @@ def measure_structure(
 
 
 MOST_MEMBERS = 12
-"""Directions of a bundle at most: the bounds of up to 16 are found at once."""
-
-WIDEST = 0.12
+"""Directions of a bundle at most: up to 16 are bounded at once."""
+WIDEST_CHORD = 0.12
 """Longest chord |u - u'| from a bundle's first direction to another: about 7 degrees."""
-
 LEAST_BUNDLES = 256
 """A run of fewer bundles is not worth a piece of work of its own."""
-
 CHORD_SLACK = 1e-6
 """Added to a chord, and a fraction of it: more than the rounding of a chord or a unit vector to float32."""
 
@@ -231,16 +225,11 @@ CHORD_SLACK = 1e-6
 class Bundles:
     """Directions cut into bundles: cones of neighbouring directions, each about one of its members."""
 
-    order: NDArray[np.int64]
-    """Shape (n,), row of each direction in the caller's order."""
-    outward: Floats
-    """Shape (n, 3), unit vectors in the order of the bundles."""
-    starts: NDArray[np.int64]
-    """Shape (b + 1,), row in ``outward`` of each bundle's first member."""
-    middle: NDArray[np.int64]
-    """Shape (b,), row in ``outward`` of the member that is each bundle's axis."""
-    chord: Floats
-    """Shape (b,), largest |u - axis| of its members, rounded up."""
+    order: NDArray[np.int64]  # shape (n,), row of each direction in the caller's order
+    outward: Floats  # shape (n, 3), unit vectors in the order of the bundles
+    starts: NDArray[np.int64]  # shape (b + 1,), row in ``outward`` of each bundle's first member
+    middle: NDArray[np.int64]  # shape (b,), row in ``outward`` of the member that is each bundle's axis
+    chord: Floats  # shape (b,), largest |u - axis| of its members, rounded up
 
     def parts(self, most: int) -> list[Bundles]:
         """The bundles divided into at most ``most`` runs of equal length, none shorter than ``LEAST_BUNDLES``."""
@@ -274,7 +263,7 @@ def _cut_into_bundles(outward, starts):  # type: ignore[no-untyped-def]  # numba
     count, first = 0, 0
     starts[0] = 0
     for i in range(1, len(outward)):
-        if i % MOST_MEMBERS == 0 or _square_between(outward, i, first) > WIDEST * WIDEST:
+        if i % MOST_MEMBERS == 0 or _square_between(outward, i, first) > WIDEST_CHORD * WIDEST_CHORD:
             count += 1
             first = i
             starts[count] = i
@@ -309,6 +298,8 @@ def _square_between(outward, i, k):  # type: ignore[no-untyped-def]  # numba inf
 
 COORDINATE_SLACK = 1e-6
 """Fraction of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
+REACH_ROUNDING = 1e-5
+"""Fraction by which the distance of a sphere from the target may err: of two radii, a root and a difference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,12 +308,9 @@ class PlacedSurface:
 
     nodes: NDArray[np.float32]
     """Shape (groups, 10, 16), of the tree, as `bounds.disc_bounds` reads them."""
-    slack: float
-    """Rounding of a node's coordinate, mm."""
-    distance: float
-    """Of the target from the surface, mm: no axis is farther, for it starts there."""
-    nearest: int
-    """Row of the triangle nearest to the target."""
+    slack: float  # rounding of a node's coordinate, mm
+    distance: float  # of the target from the surface, mm: no axis is farther, for it starts there
+    nearest: int  # row of the triangle nearest to the target
 
 
 def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
@@ -330,25 +318,58 @@ def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
     nodes = np.empty((10, len(blocks.center)), np.float32)
     nodes[:3] = (blocks.center - target).T
     nodes[3:8] = blocks.disc  # normal, rho, h
-    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)  # R, of the sphere about the disc, rounded up
-    away = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
-    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)  # |c| + R: no point of the disc is farther from the target
+    nodes[8] = np.hypot(nodes[6], nodes[7]) * ROUNDED_UP  # R, of the sphere about the disc
+    from_target = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
+    nodes[9] = (from_target + nodes[8]) * ROUNDED_UP  # |c| + R: no point of the disc is farther from the target
     slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
     grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))  # one group is contiguous
     distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack)
     return PlacedSurface(grouped, slack, distance, nearest)
 
 
+@nb.njit(cache=True, error_model="numpy")
+def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-untyped-def]  # numba infers
+    """Distance of the target from a surface, mm, and the row of the nearest triangle: branch and bound over its tree.
+
+    Args:
+        target: Shape (3,), mm.
+        slack: Rounding of a node's coordinate, mm.
+    """
+    nearest, distance, waiting = 0, _from_target(triangles, np.int64(0), target), 1
+    stack = np.empty((STACK, 2), np.int64)
+    stack[0, 0], stack[0, 1] = base[-1], len(base) - 1
+    while waiting > 0:
+        waiting -= 1
+        first, level = stack[waiting, 0], stack[waiting, 1]
+        for k in range(LANES):
+            reach = nodes[first, 9, k] - 2 * nodes[first, 8, k]  # (|c| + R) - 2 R: distance of the sphere
+            if reach - slack - REACH_ROUNDING * abs(reach) >= distance:
+                continue
+            child = (first - base[level]) * LANES + k
+            if level > 0:
+                stack[waiting, 0], stack[waiting, 1] = base[level - 1] + child, level - 1
+                waiting += 1
+                continue
+            for row in range(child * LANES, (child + 1) * LANES):
+                of_row = _from_target(triangles, row, target)
+                nearest, distance = row if of_row < distance else nearest, min(of_row, distance)
+    return distance, nearest
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _from_target(triangles, row, target):  # type: ignore[no-untyped-def]  # numba infers
+    t, (x, y, z) = triangles[row], (target[0], target[1], target[2])
+    a, b, c = (t[0] - x, t[1] - y, t[2] - z), (t[3] - x, t[4] - y, t[5] - z), (t[6] - x, t[7] - y, t[8] - z)
+    return np.sqrt(axis_triangle((0.0, 0.0, 1.0), 0.0, a, b, c)[0])
+
+
 @dataclass(frozen=True, eq=False)
 class NearFaces:
     """The faces of a structure near one needle axis, which a small displacement could touch; CT frame, mm."""
 
-    triangles: Floats
-    """Shape (m, 9), corners, in blocks of 16, those that may be nearest first."""
-    faces: Floats
-    """Shape (m, 4), a sphere around each: centre, radius."""
-    blocks: Floats
-    """Shape (m / 16, 4), around each 16."""
+    triangles: Floats  # shape (m, 9), corners, in blocks of 16, those that may be nearest first
+    faces: Floats  # shape (m, 4), a sphere around each: centre, radius
+    blocks: Floats  # shape (m / 16, 4), around each 16
 
     def __len__(self) -> int:
         return len(self.triangles)

@@ -26,13 +26,10 @@ _SEGMENT_FACE = np.array([[0, 1, 1]])
 
 
 class FclEngine:
-    """FCL over bounding volume trees of the structures' triangles.
+    """FCL over bounding volume trees of the triangles of k surfaces, CT frame, mm.
 
     The distance comes from FCL's triangle-to-triangle distance with the axis as a degenerate triangle: exact to
     rounding, and 0 on contact, where the distance of an FCL capsule is accurate to 1e-6 mm and a flat -1 on contact.
-
-    Args:
-        meshes: The k surfaces, in the CT frame, mm.
     """
 
     def __init__(self, meshes: Sequence[TriangleMesh], progress: Count | None = None) -> None:
@@ -72,8 +69,8 @@ class FclEngine:
 
     def distances(self, target_ct: Floats, outward_ct: Floats, length: float) -> Floats:
         """Distances of one axis from all k structures, shape (k,), mm, 0 on contact; no nearest points."""
-        found = self._one_direction(target_ct, outward_ct, np.full(len(self._objects), length))[0]
-        return np.maximum(np.array(found, dtype=np.float64), 0.0)
+        distances, _, _ = self._one_direction(target_ct, outward_ct, np.full(len(self._objects), length))
+        return np.maximum(np.array(distances, dtype=np.float64), 0.0)
 
     def _one_direction(
         self, tip: Floats, outward: Floats, lengths: Floats
@@ -136,8 +133,7 @@ class VerifiedEngine:
     """A custom engine, verified against an exact one: its distances may be smaller than the true ones, never larger."""
 
     custom: ClearanceEngine
-    exact: ClearanceEngine
-    """Measures the same axes again, and answers all else."""
+    exact: ClearanceEngine  # measures the same axes again, and answers all else
 
     @property
     def triangles(self) -> tuple[Floats, ...]:
@@ -165,15 +161,15 @@ class VerifiedEngine:
         wrong = ~(distances <= exact.distance + CUSTOM_TOLERANCE_MM)  # NaN too
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
-            stated, away = distances[row, column], exact.distance[row, column]
-            what = f"measures {stated:.4g} mm to a structure that is {away:.4g} mm away"
+            stated, true = distances[row, column], exact.distance[row, column]
+            what = f"measures {stated:.4g} mm to a structure that is {true:.4g} mm away"
             refuse(what, name, allowed, "engine_contradicted")
         return AxisDistances(np.minimum(distances, exact.distance), exact.depth, exact.nearest)
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """Whether either engine finds a contact; see `ClearanceEngine`."""
-        asked = structure, target_ct, outward_ct, length, radius
-        return self.exact.collides(*asked) or self.custom.collides(*asked)
+        query = structure, target_ct, outward_ct, length, radius
+        return self.exact.collides(*query) or self.custom.collides(*query)
 
     def of(self, columns: Ints) -> VerifiedEngine:
         """Both engines for some of their structures; see `ClearanceEngine`."""
@@ -198,7 +194,7 @@ class CrossChecked:
 
 
 def cross_check(
-    found: AxisDistances,
+    measured: AxisDistances,
     meshes: tuple[TriangleMesh, ...],
     target_ct: Floats,
     outward_ct: Floats,
@@ -210,7 +206,7 @@ def cross_check(
     """Measure some of the directions again with `FclEngine`.
 
     Args:
-        found: What an engine measured, n directions and k structures.
+        measured: By an engine, n directions and k structures.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
         length: Of the axes, one number, shape (k,) or (n, k), mm.
@@ -220,12 +216,13 @@ def cross_check(
         CrossCheckError: A distance differs by more than rounding.
     """
     rows = rng.choice(len(outward_ct), min(count, len(outward_ct)), replace=False)
-    rated = FclEngine(meshes).measure(target_ct, outward_ct[rows], np.broadcast_to(length, found.distance.shape)[rows])
-    difference = np.abs(rated.distance - found.distance[rows])
+    lengths = np.broadcast_to(length, measured.distance.shape)[rows]
+    reference = FclEngine(meshes).measure(target_ct, outward_ct[rows], lengths)
+    difference = np.abs(reference.distance - measured.distance[rows])
     if difference.size and difference.max() > AGREE_MM:
         row, column = np.unravel_index(int(difference.argmax()), difference.shape)
         raise CrossCheckError(
-            f"direction {rows[row]}, structure {column}: the engine finds {found.distance[rows[row], column]:.9f} mm,"
-            f" FCL {rated.distance[row, column]:.9f} mm"
+            f"direction {rows[row]}, structure {column}: the engine finds"
+            f" {measured.distance[rows[row], column]:.9f} mm, FCL {reference.distance[row, column]:.9f} mm"
         )
     return CrossChecked(len(rows), difference.size, float(difference.max(initial=0.0)))

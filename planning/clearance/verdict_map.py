@@ -1,6 +1,6 @@
 """Verdicts of a grid of directions without distances: which structure is the first whose margin a needle breaks.
 
-A needle of direction u from the target comes within r of a ball (centre c from the target, radius R) only if
+A needle of direction u from the target comes within r of a sphere (centre c from the target, radius R) only if
 
     angle(u, c) <= asin((R + r) / |c|),    any u where |c| <= R + r,    and none where |c| > R + r + L.
 
@@ -29,23 +29,18 @@ from puncture_twin.planning.geometry.containment import contains
 
 BLOCKED, FREE, TIED = 0, 1, 2
 """States of a direction while structures are added: blocked, free so far, or so near to a limit that FCL decides."""
-
 SLACK_MM = 1e-3
 """Added to a limit where it decides what is visited: more than `NEAR_THRESHOLD_MM` and all rounding."""
-
 SLACK_RAD = 1e-6
 """By which a cone is widened: more than the rounding of its angles, arcsines close to a right angle included."""
-
-WHOLE = 0.999
+ALL_AROUND_SINE = 0.999
 """Sine of a cone's half-angle from which on all directions are visited."""
-
-WIDE = 4.0
-"""Limits that a triangle's radius must hold before the triangle is cut: a smaller one costs less than its parts."""
-
-SLIM, NEAR = 0.25, 1.0 / 3.0
-"""A triangle is cut where its area is a small part of its radius squared, or its radius a large one of its distance:
-its ball's cone would visit far more directions than the triangle blocks."""
-
+CUT_FROM_LIMITS = 4.0
+"""Radius of a triangle, in limits, from which on it may be cut: a smaller one costs less than its parts."""
+SLIVER_AREA = 0.25
+"""Area over radius squared below which a triangle is cut: its cone holds far more directions than it blocks."""
+CLOSE_RADIUS = 1.0 / 3.0
+"""Radius over distance from the target above which a triangle is cut, for the same reason."""
 PARTS = 64
 """Parts of a triangle that wait at most: each cut of the longest edge adds one."""
 
@@ -102,7 +97,7 @@ class VerdictMap:
 
 
 def _spheres(blocks: Blocks) -> Floats:
-    """Centre and radius of the ball about each block, shape (b, 4), mm."""
+    """Centre and radius of the sphere about each block, shape (b, 4), mm."""
     count = len(blocks.local)
     radius = np.hypot(*blocks.disc[3:, :count].astype(np.float64)) * (1 + 1e-6)
     return np.column_stack([blocks.center[:count], radius])
@@ -114,8 +109,10 @@ def _block(triangles, spheres, target, frame, angles, outward, lengths, longest,
     reach, waiting = limit + SLACK_MM, np.empty((PARTS, 9))
     for block in range(len(spheres)):
         x, y, z = spheres[block, 0] - target[0], spheres[block, 1] - target[1], spheres[block, 2] - target[2]
-        away, about = math.sqrt(x * x + y * y + z * z), spheres[block, 3] + reach
-        if away > about + longest or not _any_free(state, _window(x, y, z, away, about, frame, angles, state.shape)):
+        distance, contact_radius = math.sqrt(x * x + y * y + z * z), spheres[block, 3] + reach
+        if distance > contact_radius + longest:
+            continue
+        if not _any_free(state, _window(x, y, z, distance, contact_radius, frame, angles, state.shape)):
             continue
         for row in range(block * lanes, (block + 1) * lanes):
             for k in range(9):
@@ -133,21 +130,22 @@ def _part(waiting, last, reach, frame, angles, outward, lengths, longest, limit,
     m = (a[0] + b[0] + c[0]) / 3.0, (a[1] + b[1] + c[1]) / 3.0, (a[2] + b[2] + c[2]) / 3.0
     square = _dot(m, m)
     radius = math.sqrt(max(_square(a, m), _square(b, m), _square(c, m)))
-    away, about = math.sqrt(square), radius + reach
-    if away > about + longest:
+    distance, contact_radius = math.sqrt(square), radius + reach
+    if distance > contact_radius + longest:
         return last
-    window = _window(m[0], m[1], m[2], away, about, frame, angles, state.shape)
-    if radius > WIDE * reach and last + 1 < PARTS:
+    window = _window(m[0], m[1], m[2], distance, contact_radius, frame, angles, state.shape)
+    if radius > CUT_FROM_LIMITS * reach and last + 1 < PARTS:
         if not _any_free(state, window):
             return last
-        if _area(a, b, c) < SLIM * radius * radius or radius > NEAR * away:
+        if _area(a, b, c) < SLIVER_AREA * radius * radius or radius > CLOSE_RADIUS * distance:
             return _cut(waiting, last, a, b, c)
-    first, end, low, high, around, turns = window
-    far2, near2 = (about * about) * (1 + 1e-9) + 1e-6, (limit - SLACK_MM) * abs(limit - SLACK_MM)
+    first, end, low, high, around, circles = window
+    # Of the middle, squared and with slack for rounding: beyond the first all is free, within the second blocked.
+    far2, near2 = (contact_radius * contact_radius) * (1 + 1e-9) + 1e-6, (limit - SLACK_MM) * abs(limit - SLACK_MM)
     sure2, tie2, columns = (limit - ROUNDING_MM) ** 2, (limit + NEAR_THRESHOLD_MM) ** 2, state.shape[1]
     for i in range(first, end):
-        for turn in range(turns[0], turns[1] + 1):
-            begin, stop = _columns(low, high, around, turn, columns)
+        for circle in range(circles[0], circles[1] + 1):
+            begin, stop = _columns(low, high, around, circle, columns)
             for k in range(begin, stop):
                 if state[i, k] == BLOCKED:
                     continue
@@ -161,36 +159,40 @@ def _part(waiting, last, reach, frame, angles, outward, lengths, longest, limit,
                 if middle2 < near2:  # the middle is a point of the triangle
                     state[i, k] = BLOCKED
                     continue
-                found = axis_triangle(u, length, a, b, c)[0]
-                if found < sure2:
+                square_distance = axis_triangle(u, length, a, b, c)[0]
+                if square_distance < sure2:
                     state[i, k] = BLOCKED
-                elif found < tie2:
+                elif square_distance < tie2:
                     state[i, k] = TIED
     return last
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _window(x, y, z, away, about, frame, angles, shape):  # type: ignore[no-untyped-def]  # numba infers
-    """Rows and columns of the grid that hold the cone of a ball.
+def _window(x, y, z, distance, contact_radius, frame, angles, shape):  # type: ignore[no-untyped-def]  # numba infers
+    """Rows and columns of the grid that hold the cone of a sphere.
 
     A circle of angular radius a about a point of polar angle p spans azimuths of +- asin(sin a / sin p).
+
+    Args:
+        distance: Of the sphere's centre (x, y, z) from the target, |c|, mm.
+        contact_radius: R + r, within which of the centre a needle comes too near, mm.
 
     Returns:
         The first row and the row after the last; the first and the last column, not rounded; columns of a full circle;
         and by how many circles these columns are to be displaced, from and to.
     """
     rows, columns, around = shape[0], shape[1], 2.0 * math.pi / angles[2]
-    if about >= WHOLE * away:
+    if contact_radius >= ALL_AROUND_SINE * distance:
         return 0, rows, 0.0, columns - 1.0, around, (0, 0)
     ex = frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z
     ey = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z
     ez = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
     across = math.sqrt(ex * ex + ey * ey)
-    polar, half = math.atan2(across, ez), math.asin(about / away) + SLACK_RAD
+    polar, half = math.atan2(across, ez), math.asin(contact_radius / distance) + SLACK_RAD
     first = max(0, math.ceil((polar - half - angles[0]) / angles[2]))
     end = min(rows, math.floor((polar + half - angles[0]) / angles[2]) + 1)
-    sine = about / across
-    if half >= polar or half >= math.pi - polar or sine >= WHOLE:
+    sine = contact_radius / across
+    if half >= polar or half >= math.pi - polar or sine >= ALL_AROUND_SINE:
         return first, end, 0.0, columns - 1.0, around, (0, 0)
     azimuth, half = math.atan2(ey, ex) - angles[1], math.asin(sine) + SLACK_RAD
     low, high = (azimuth - half) / angles[2], (azimuth + half) / angles[2]
@@ -198,18 +200,18 @@ def _window(x, y, z, away, about, frame, angles, shape):  # type: ignore[no-unty
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _columns(low, high, around, turn, columns):  # type: ignore[no-untyped-def]  # numba infers
+def _columns(low, high, around, circle, columns):  # type: ignore[no-untyped-def]  # numba infers
     """The first column of a window, displaced by full circles, and the column after its last."""
-    by = turn * around
+    by = circle * around
     return max(0, math.ceil(low + by)), min(columns, math.floor(high + by) + 1)
 
 
 @nb.njit(cache=True, error_model="numpy")
 def _any_free(state, window):  # type: ignore[no-untyped-def]  # numba infers
     """Whether any direction of a window is not blocked."""
-    first, end, low, high, around, turns = window
-    for turn in range(turns[0], turns[1] + 1):
-        begin, stop = _columns(low, high, around, turn, state.shape[1])
+    first, end, low, high, around, circles = window
+    for circle in range(circles[0], circles[1] + 1):
+        begin, stop = _columns(low, high, around, circle, state.shape[1])
         for i in range(first, end):
             total = 0
             for k in range(begin, stop):

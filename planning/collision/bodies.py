@@ -1,15 +1,12 @@
-"""Bodies of the arm for FCL and for bounds: links and tool as convex pieces, bare and padded, and spheres around them.
+"""Bodies of the arm and the patient for FCL: links and tool as convex pieces, bare and padded; the skin in parts.
 
-`arm_bodies` makes all of them; a `Solid` is built by FCL when it is first queried. A `SphereTree` encloses a body: what
-is clear of its spheres is clear of the body. A sphere is convex, so it contains the convex hull of any points in it.
-A convex piece is cut by planes; the corners of a part are the piece's corners on that side and the points where its
-edges cross the plane; a sphere about those corners contains the part (docs/concepts/arm-collisions.md).
-Where surfaces do not touch, `LooseParts` tells whether a part of one lies within a convex piece.
+`arm_bodies` makes all of them; a `Solid` is built by FCL when it is first queried, and so is each part of an `FclSkin`.
+A `Check` is one query to FCL. Where surfaces do not touch, `LooseParts` tells whether a part of one lies within a
+convex piece.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -19,8 +16,8 @@ from typing import NamedTuple
 import fcl
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.links import LINK_NAMES, Link, collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
@@ -28,20 +25,18 @@ from puncture_twin.planning.arm.urdf.arm_urdf import hull
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.collision.spheres import prism
+from puncture_twin.planning.collision.state_checker import PATIENT, Contact
+from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined, packed_meshes, unpacked_meshes
 from puncture_twin.planning.geometry.rigid import pose
 
-BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
-"""The bodies of the arm, from the base on; not every arm has a tool."""
-
 FLANGE_FRAME = 6
 """The frame of wrist 3, whose origin and axes are the flange's."""
-
 NEVER_TESTED = frozenset((*pairwise(LINK_NAMES), *combinations(("wrist_3", "tool", "holder", "needle"), 2)))
 """Pairs that touch by construction, connected by a joint or bolted together; of an own arm's neighbours what is not
 joined is tested."""
-
 NEVER_TOUCHING = frozenset({("wrist_2", "holder"), ("wrist_2", "needle")})
 """Pairs that cannot touch where the arm ships with the program: holder and needle begin at the flange, beyond wrist 2,
 and point away at every angle; wrist 2 of an own arm may carry a bracket."""
@@ -60,17 +55,12 @@ class Shape(NamedTuple):
 class Body:
     """One body of the arm."""
 
-    name: str
-    """One of ``BODY_NAMES``."""
-    frame: int
-    """Index of its frame among ``link_poses``."""
-    T_frame_body: Floats
-    """Shape (4, 4), mm: its shapes in that frame."""
+    name: str  # one of ``BODY_NAMES``
+    frame: int  # index of its frame among ``link_poses``
+    T_frame_body: Floats  # shape (4, 4), mm: its shapes in that frame
     bare: Shape
-    full: Shape
-    """The body grown by the padding; ``bare`` itself where there is none."""
-    radius_mm: float
-    """Every point of ``bare`` lies within this distance of the shapes' origin."""
+    full: Shape  # the body grown by the padding; ``bare`` itself where there is none
+    radius_mm: float  # every point of ``bare`` lies within this distance of the shapes' origin
 
     @cached_property
     def box(self) -> Floats:
@@ -122,10 +112,7 @@ def _cylinder(radius_mm: float, length_mm: float) -> Shape:
 
 
 def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...]:
-    """All bodies, in the order of ``BODY_NAMES``, at the zero configuration of their own frames.
-
-    Args:
-        padding_mm: How much fuller ``full`` is than ``bare``.
+    """All bodies, in the order of ``BODY_NAMES``, at the zero configuration of their own frames; ``full`` is padded.
 
     Raises:
         InputError: If the model's meshes do not ship, or the tool is flat.
@@ -155,11 +142,7 @@ def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...
 
 
 class Solid:
-    """A moving shape; its bounding spheres and planes answer most questions before FCL builds it.
-
-    Args:
-        make: Makes its geometry, mm.
-    """
+    """A moving shape, mm, that ``make`` builds for FCL at its first query; bounds answer most questions before."""
 
     def __init__(self, make: Callable[[], fcl.CollisionGeometry], pose: fcl.Transform | None = None) -> None:
         self._make = make
@@ -205,136 +188,11 @@ def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
     return hull((mesh.vertices[:, None] + corners).reshape(-1, 3))
 
 
-PRISM_SIDES = 24
-"""Sides of the prism about a cylinder: 0.9 % fuller than it."""
-
-
-FINE_SIDES = 96
-"""Sides of the prism about a cylinder that is tested against triangles: 0.05 % fuller than it."""
-
-
-def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
-    """Corners of a prism about a cylinder along z, centred: shape (2 ``sides``, 3), mm; those of one end first."""
-    turn = 2.0 * np.pi * np.arange(sides) / sides
-    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)  # circumscribed: encloses the circle
-    ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    half = length_mm / 2.0 + SLACK_MM
-    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
-
-
-def finer_prism(corners: Floats) -> Floats:
-    """Corners of a prism of ``FINE_SIDES`` about the cylinder that :func:`prism` gave these corners about, as there."""
-    radius_mm = float(np.hypot(corners[:, 0], corners[:, 1]).max()) * np.cos(2.0 * np.pi / len(corners))
-    return prism(radius_mm, float(np.ptp(corners[:, 2])), FINE_SIDES)
-
-
-SLACK_MM = 1e-6
-"""Every sphere is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
-
-CENTRE_STEPS = 25
-"""Steps of the walk to a sphere's centre; how good it is decides how tight the sphere is, never whether it encloses."""
-
-LEAF_RADIUS_MM = 30.0
-"""Parts are cut until their sphere is no larger: half of a UR3 wrist's size."""
-
-
-class BoundingSphere(NamedTuple):
-    """A sphere, mm."""
-
-    centre: Floats
-    radius: float
-
-
-def enclosing_sphere(points: Floats) -> BoundingSphere:
-    """A small sphere about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
-    centre = np.empty(3)
-    radius = _walk_to_centre(np.ascontiguousarray(points), CENTRE_STEPS, centre)
-    return BoundingSphere(centre, radius + SLACK_MM)
-
-
-@nb.njit(cache=True)
-def _walk_to_centre(points, steps, best):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``best`` (3,) with the best centre visited for points (n, 3); the radius that it needs."""
-    x, y, z = [(points[:, i].min() + points[:, i].max()) / 2.0 for i in range(3)]
-    least = math.inf
-    for step in range(1, steps + 1):
-        most, far = -1.0, 0
-        for i in range(len(points)):
-            squared = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
-            if squared > most:
-                most, far = squared, i
-        if most < least:
-            least = most
-            best[0], best[1], best[2] = x, y, z
-        x += (points[far, 0] - x) / (step + 1)
-        y += (points[far, 1] - y) / (step + 1)
-        z += (points[far, 2] - z) / (step + 1)
-    return math.sqrt(least)
-
-
-@dataclass(frozen=True, eq=False)
-class SphereTree:
-    """Spheres in a tree, the root first: every node's sphere encloses all parts below it."""
-
-    centres: Floats
-    """Shape (n, 3), mm, in the frame of the body."""
-    radii: Floats
-    """Shape (n,), mm."""
-    children: NDArray[np.int64]
-    """Shape (n, 2): rows of the two children; -1 at a leaf."""
-
-    @property
-    def leaves(self) -> NDArray[np.int64]:
-        """Rows of the leaves, whose spheres together cover the body."""
-        return np.flatnonzero(self.children[:, 0] < 0)
-
-
-def halves(corners: Floats) -> tuple[Floats, Floats]:
-    """A convex hull's corners (n, 3), cut in the middle of its longest side: the corners of the two parts, mm."""
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    axis = int(np.argmax(high - low))
-    cut = (low[axis] + high[axis]) / 2.0
-    faces = scipy.spatial.ConvexHull(corners).simplices
-    below = corners[:, axis] < cut
-    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    crosses = below[starts] != below[ends]  # Qhull turns its faces either way round: each edge counts from both
-    a, b = corners[starts[crosses]], corners[ends[crosses]]
-    crossings = a + ((cut - a[:, axis]) / (b[:, axis] - a[:, axis]))[:, None] * (b - a)
-    return np.concatenate([corners[below], crossings]), np.concatenate([corners[~below], crossings])
-
-
-def sphere_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> SphereTree:
-    """Spheres that enclose the union of convex pieces, each given by its corners (n, 3), mm."""
-    spheres: list[BoundingSphere] = []
-    children: list[tuple[int, int]] = []
-
-    def add(parts: Sequence[Floats]) -> int:
-        row = len(spheres)
-        spheres.append(enclosing_sphere(np.concatenate(parts)))
-        children.append((-1, -1))
-        if len(parts) > 1:
-            half = len(parts) // 2
-            children[row] = (add(parts[:half]), add(parts[half:]))
-        elif spheres[row].radius > leaf_radius_mm:
-            below, above = halves(parts[0])
-            children[row] = (add([below]), add([above]))
-        return row
-
-    add(pieces)
-    return SphereTree(
-        np.array([sphere.centre for sphere in spheres]),
-        np.array([sphere.radius for sphere in spheres]),
-        np.array(children, dtype=np.int64),
-    )
-
-
 class LooseParts(NamedTuple):
     """The connected parts of a surface."""
 
-    corners: Floats
-    """Shape (k, 3), mm: a corner of each."""
-    sizes: Floats
-    """Shape (k, 3), mm: the edges of the box about each."""
+    corners: Floats  # shape (k, 3), mm: a corner of each
+    sizes: Floats  # shape (k, 3), mm: the edges of the box about each
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> LooseParts:
@@ -372,3 +230,127 @@ def within(points: Floats, pieces: Sequence[Floats]) -> Bools:
     for planes in pieces:
         inside |= (points @ planes[:, :3].T + planes[:, 3] <= 0.0).all(axis=1)
     return inside
+
+
+PART_TRIANGLES = 8192
+"""Triangles in one tree: FCL takes some 4 us to build for each, and 20 us to query a tree."""
+ROUNDING_MM = 1e-6
+"""By how much a body's box is grown: far above the rounding of its pose."""
+
+
+class FclSkin:
+    """A surface in parts, each with a tree of its own, which FCL builds when a body first comes near the part.
+
+    To build a tree takes longer than most questions, and the arm comes near to few parts of a patient. FCL tests a
+    triangle by itself, whichever tree it is in, so the surface touches what one of its parts touches.
+
+    Args:
+        mesh: The surface, mm.
+
+    Raises:
+        InputError: FCL calls a NaN vertex free and dies of an index out of range: so that is looked for first.
+    """
+
+    def __init__(self, mesh: TriangleMesh, name: str) -> None:
+        count = len(mesh.vertices)
+        usable = len(mesh.faces) > 0 and bool(np.isfinite(mesh.vertices).all())
+        if not usable or mesh.faces.min() < 0 or mesh.faces.max() >= count:
+            refuse("mesh is empty, not finite or has an index out of range", name, "a valid mesh", "bad_mesh")
+        self._mesh = mesh
+        self._trees: dict[int, fcl.CollisionObject] = {}
+
+    def touches(self, solid: Solid, box: Floats) -> bool:
+        """Whether a body, enclosed by a ``box`` (2, 3), mm, of its own frame, touches the surface where it is."""
+        return any(touch(self._tree(part), solid.made) for part in self._near(solid.pose, box))
+
+    def collides_with(self, body: Body) -> bool:
+        """Whether a body touches the surface where it is, or has a part of it within."""
+        return self.touches(body.full.surface, body.box) or self.has_part_within(body)
+
+    def has_part_within(self, body: Body) -> bool:
+        """Whether a connected part of the surface lies within a link where it is, which :meth:`touches` does not see.
+
+        Of a link FCL sees the surface, which such a part does not touch. Holder and needle are solid for it.
+        """
+        pose = body.full.surface.pose
+        if not body.hollow or not self._near(pose, body.box):
+            return False
+        small = np.linalg.norm(self._loose.sizes, axis=1) <= float(np.linalg.norm(body.box[1] - body.box[0]))
+        points = (self._loose.corners[small] - pose.getTranslation()) @ pose.getRotation()
+        near = np.all((points >= body.box[0]) & (points <= body.box[1]), axis=1)
+        return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
+
+    def _near(self, pose: fcl.Transform, box: Floats) -> list[int]:
+        """Parts of the surface that a box about a body, in the body's frame, may touch."""
+        R = pose.getRotation()
+        centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
+        reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
+        near = np.all((self._bounds[:, 1] >= centre - reach) & (self._bounds[:, 0] <= centre + reach), axis=1)
+        found: list[int] = np.flatnonzero(near).tolist()
+        return found
+
+    @cached_property
+    def _loose(self) -> LooseParts:
+        return LooseParts.of(self._mesh)
+
+    @cached_property
+    def _parts(self) -> list[Ints]:
+        order = kd_order(self._mesh.triangles.mean(axis=1), PART_TRIANGLES)
+        return np.split(order, range(PART_TRIANGLES, len(order), PART_TRIANGLES))
+
+    @cached_property
+    def _bounds(self) -> Floats:
+        return np.array([box_of(self._mesh.triangles[part].reshape(-1, 3)) for part in self._parts])
+
+    def _tree(self, part: int) -> fcl.CollisionObject:
+        if part not in self._trees:
+            faces = self._mesh.faces[self._parts[part]]
+            used, corners = np.unique(faces, return_inverse=True)
+            piece = TriangleMesh(self._mesh.vertices[used], corners.reshape(faces.shape).astype(np.int32))
+            self._trees[part] = fcl.CollisionObject(surface(piece))
+        return self._trees[part]
+
+
+class FclPatient(NamedTuple):
+    """The patient for FCL: the skin, and what else the CT shows."""
+
+    skin: FclSkin
+    outside: FclSkin | None
+
+    def touched_part(self, body: Body) -> str | None:
+        """The part that a body touches where it is: the skin, ``outside_body`` where that is all, or None."""
+        if self.skin.collides_with(body):
+            return PATIENT
+        return OUTSIDE_BODY if self.outside is not None and self.outside.collides_with(body) else None
+
+
+class Check(NamedTuple):
+    """One query to FCL: whether two shapes touch."""
+
+    contact: Contact  # what it means if they do
+    first: Solid | FclPatient  # the patient, a box, or a piece of a body
+    second: Solid
+    first_body: Body | None  # the body that ``first`` moves with; None for skin and boxes
+    second_body: Body
+    hulls: tuple[Floats | None, Floats] | None
+    """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
+
+    @property
+    def before_last_joint(self) -> bool:
+        """Whether it is of two bodies of the arm neither of which moves with the last joint."""
+        return self.first_body is not None and max(self.first_body.frame, self.second_body.frame) < FLANGE_FRAME
+
+    def contact_at(self, frames: Floats) -> Contact | None:
+        """The contact, if the two shapes touch where ``link_poses`` (7, 4, 4) has them; see `contact_found`."""
+        self.second.place(self.second_body.pose(frames))
+        if self.first_body is not None:
+            assert not isinstance(self.first, FclPatient)  # it belongs to no body
+            self.first.place(self.first_body.pose(frames))
+        return self.contact_found()
+
+    def contact_found(self) -> Contact | None:
+        """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
+        if not isinstance(self.first, FclPatient):
+            return self.contact if touch(self.first.made, self.second.made) else None
+        part = self.first.touched_part(self.second_body)
+        return None if part is None else self.contact._replace(other=part)

@@ -21,7 +21,7 @@ import scipy
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import Link, collision_links, model_urdf
-from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.tool import Box, Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
@@ -29,12 +29,16 @@ from puncture_twin.planning.collision.bodies import (
     NEVER_TESTED,
     NEVER_TOUCHING,
     Body,
+    Check,
+    FclPatient,
+    FclSkin,
     Solid,
     arm_bodies,
     convex,
+    padded,
     surface,
+    touch,
 )
-from puncture_twin.planning.collision.patient import Check, FclPatient, FclSkin, check_hanging, refuse_base_in
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
     NEEDLE_IN_PATIENT,
@@ -46,6 +50,7 @@ from puncture_twin.planning.collision.state_checker import (
     SweptBodies,
     require_finite,
 )
+from puncture_twin.planning.geometry.containment import Side, side_of, winding_number
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 
@@ -131,18 +136,16 @@ class CellChecker:
     def contacts(
         self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
     ) -> list[Contact | None]:
-        """First contact of each of many states, shape (n, 6), rad; known contacts are checked first.
+        """First contact of each of many states, shape (n, 6), rad. Raises InputError: If a state is not finite.
 
-        Raises:
-            InputError: If a state is not finite.
+        Where ``round_clear`` (n,) says so, holder and needle are known to touch neither patient nor boxes.
         """
         return [self.contact(state, needle_may_touch_patient=needle_may_touch_patient) for state in q]
 
     def folded(self, q: Floats) -> Bools:
         """Which of many states (n, 6), rad, have contact between links before the last joint: at any q6.
 
-        Raises:
-            InputError: If a state is not finite.
+        Raises InputError: If a state is not finite.
         """
         before = [check for check in self._checks if check.before_last_joint]
         found = np.zeros(len(q), np.bool_)
@@ -152,13 +155,9 @@ class CellChecker:
         return found
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
-        """The first state of a path with a contact, and the contact; None when all are clear.
+        """The first state of a path (m, 6), rad, with a contact, and the contact; None when all are clear.
 
-        Args:
-            q_path: Shape (m, 6), rad.
-
-        Raises:
-            InputError: If a state is not finite.
+        Raises InputError: If a state is not finite.
         """
         for index, q in enumerate(q_path):
             contact = self.contact(q, needle_may_touch_patient=needle_may_touch_patient)
@@ -167,15 +166,9 @@ class CellChecker:
         return None
 
     def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:
-        """The smallest of one kind of distance.
+        """The smallest distance of one kind, a ``pair`` of `DISTANCE_PAIRS`, at ``q`` (6,), rad; or of one body of it.
 
-        Args:
-            q: Shape (6,), rad.
-            pair: One of ``DISTANCE_PAIRS``.
-            body: Only from this one of the pair's bodies.
-
-        Raises:
-            InputError: If ``q`` is not finite, or there is no such kind or body.
+        Raises InputError: If ``q`` is not finite, or there is no such kind or body.
         """
         names = DISTANCE_PAIRS.get(pair, ())
         if not names or (body is not None and body not in names):
@@ -187,24 +180,16 @@ class CellChecker:
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
     def distances(self, q: Floats) -> Distances:
-        """Least distances of moving links and tool from patient and boxes.
+        """Least distances of moving links and tool from patient and boxes at ``q`` (6,), rad.
 
-        Args:
-            q: Shape (6,), rad.
-
-        Raises:
-            InputError: If ``q`` is not finite.
+        Raises InputError: If ``q`` is not finite.
         """
         return Distances(*(self.nearest(q, pair) for pair in DISTANCE_PAIRS))
 
     def sweep_mm(self, q_path: Floats) -> Floats:
-        """Bound on every body's motion along each segment of a path.
+        """Bound on every body's motion along each segment of a path (m, 6), rad: shape (m - 1,), mm.
 
-        Args:
-            q_path: Shape (m, 6), rad.
-
-        Returns:
-            Shape (m - 1,), mm; see :meth:`SweptBodies.bounds_mm`.
+        See :meth:`SweptBodies.bounds_mm`.
         """
         return np.asarray(self.swept.bounds_mm(q_path).max(axis=1))
 
@@ -286,10 +271,8 @@ def joined_pieces(model: UrModel) -> Mapping[tuple[str, str], Bools]:
 
 ANGLES = 72
 """Angles at which a joint is tested, evenly over the turn: every 5 degrees."""
-
 APART_MM = 1.0
 """mm between two pieces that still count as joined: too little for a surface to pass through."""
-
 Solids = Sequence[Sequence[fcl.CollisionObject]]
 
 
@@ -338,3 +321,58 @@ def _place(solids: Sequence[fcl.CollisionObject], T: Floats) -> None:
 def _gaps_mm(first: Sequence[fcl.CollisionObject], second: Sequence[fcl.CollisionObject]) -> Floats:
     """Distances between pieces, shape (n, m), mm; at most 0 where they touch."""
     return np.array([[fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult()) for b in second] for a in first])
+
+
+def refuse_base_in(
+    model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, surface: TriangleMesh
+) -> None:
+    """Refuse a base that is in the patient, or in what the CT shows outside of the body.
+
+    Args:
+        patient: The skin, base frame, mm.
+        surface: The skin, and behind it what the CT shows besides, likewise; the same where that is nothing.
+    """
+    centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
+    hit = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
+    if hit or _encloses(patient, centre):
+        refuse("the robot's base is in the patient", "workcell", "a base outside the skin", "base_in_patient")
+    if surface is not patient and _encloses(surface, centre):
+        what = "the robot's base is in space not known to be free: the table in the CT, or beyond the image"
+        allowed = 'a base outside of it; if no body is there, [ct] arms = "none" or beyond_mm'
+        refuse(what, "workcell", allowed, "base_in_unseen")
+
+
+def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
+    """Whether a point lies inside a surface; more than half around an open one counts too."""
+    low, high = mesh.bounds
+    if not np.all((point >= low) & (point <= high)) and abs(winding_number(mesh, point)) <= 0.5:
+        return False  # outside, or an open surface that goes less than half around: whether it is open does not matter
+    side = side_of(mesh, point)
+    return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
+
+
+CARRIERS = ("wrist_3", "holder", "needle")
+"""What a tool is bolted to."""
+
+
+def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
+    """Refuse a tool of which a part touches neither wrist, holder nor needle, nor a part that does.
+
+    Raises InputError: Says how large the tool is and where it lies.
+    """
+    free = [fcl.CollisionObject(convex(padded(piece, APART_MM))) for piece in tool.pieces]
+    carriers = [body for body in bodies if body.name in CARRIERS]
+    hanging: list[fcl.CollisionObject] = []
+    for body in carriers:
+        for solid in body.bare.solids:
+            solid.place(fcl.Transform(body.T_frame_body[:3, :3], body.T_frame_body[:3, 3]))
+            hanging.append(solid.made)
+    while hanging and free:
+        one = hanging.pop()
+        hanging += [piece for piece in free if touch(one, piece)]
+        free = [piece for piece in free if piece not in hanging]
+    if free:
+        low, high = tool.mesh.bounds
+        span = " by ".join(f"{a:.4g}..{b:.4g}" for a, b in zip(low, high, strict=True))
+        what = f"the tool ({span} mm in the flange's frame) is not connected to wrist, holder or needle"
+        refuse(what, tool.key, "a connected body: check unit, position_mm, rotation_deg", "tool_detached")

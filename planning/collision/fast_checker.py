@@ -17,11 +17,11 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.collision.bodies import Check
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.kernels import segments
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.packed import ROUND
-from puncture_twin.planning.collision.patient import Check
 from puncture_twin.planning.collision.proofs import Motion, Proofs, without_neighbours
 from puncture_twin.planning.collision.state_checker import (
     NEEDLE_IN_PATIENT,
@@ -40,15 +40,7 @@ class FastChecker(CellChecker):
     The questions come in the same order and their answers are FCL's or proven, so each verdict is the same, down to the
     contact that is named (docs/concepts/arm-collisions.md). Distances are FCL's. Not for several threads at once.
 
-    Args:
-        boxes: Obstacles, base frame.
-        patient: The body's surface, base frame.
-        outside: Surfaces outside of the body, such as a table, base frame.
-        padding_mm: Distance at which patient or boxes count as touched.
-        cache: Where the enclosures of the arm's bodies are kept.
-
-    Raises:
-        InputError: As :class:`CellChecker` does.
+    Args and errors are those of :class:`CellChecker`; ``cache`` keeps the enclosures of the arm's bodies.
     """
 
     def __init__(
@@ -82,7 +74,7 @@ class FastChecker(CellChecker):
     def contacts(
         self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
     ) -> list[Contact | None]:
-        """See :meth:`StateChecker.contacts`."""
+        """See :meth:`CellChecker.contacts`."""
         states = np.asarray(q, dtype=np.float64).reshape(-1, 6)
         require_finite(states)
         frames, mask = link_poses(self.model, states), self._masks[needle_may_touch_patient]
@@ -92,7 +84,7 @@ class FastChecker(CellChecker):
         return self._first_found(frames, tested, known)
 
     def folded(self, q: Floats) -> Bools:
-        """See :meth:`StateChecker.folded`."""
+        """See :meth:`CellChecker.folded`."""
         states = np.asarray(q, dtype=np.float64).reshape(-1, 6)
         require_finite(states)
         frames, all_alike = link_poses(self.model, states), np.zeros(len(states), np.int64)
@@ -174,11 +166,9 @@ class FastChecker(CellChecker):
 
 LOOK_FIRST_RAD = 0.125
 """Down to parts of this length a segment is halved for all checks together: what it touches is found soonest so."""
-
 FINE_MM = 1.0
 """A state answers for a part of a segment within which no body moves farther from it. So states that were checked are
 no more than 2 mm of motion apart, which with 1 mm of padding proves the path between them; see :class:`CellChecker`."""
-
 QUESTIONS = 256
 """Space for the queries that one segment leaves to FCL, at first."""
 

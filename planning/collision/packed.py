@@ -22,40 +22,35 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.collision.bodies import (
+from puncture_twin.planning.collision.bodies import Body, Check
+from puncture_twin.planning.collision.kernels.hulls import Hulls
+from puncture_twin.planning.collision.kernels.proofs import Movers, SkinTree
+from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
+from puncture_twin.planning.collision.spheres import (
     CENTRE_STEPS,
     LEAF_RADIUS_MM,
     PRISM_SIDES,
     SLACK_MM,
-    Body,
     SphereTree,
     enclosing_sphere,
     sphere_tree,
 )
-from puncture_twin.planning.collision.kernels.hulls import Hulls
-from puncture_twin.planning.collision.kernels.proofs import Movers, SkinTree
-from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
-from puncture_twin.planning.collision.patient import Check
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, even_directions
 from puncture_twin.planning.geometry.triangle_distance import farthest_from
 
 NO_BOX = -1.0
 """Half sizes of what is no box."""
-
 ROUND = ("holder", "needle")
 """Bodies that are cylinders: their hulls are prisms about them."""
-
 INSIDE = 1e-5
 """By this fraction a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
-
 Axes = tuple[Floats, Floats, Floats]
 
 
 COARSE_DIRECTIONS = 60
 """Directions in which a coarse hull is as wide as the hull: 26 degrees apart, so a round body of 45 mm bulges out by
 1.5 mm."""
-
 WORKCELL_FRAME = 0
 """The frame of what does not move: the base's."""
 
@@ -90,7 +85,7 @@ class PackedHulls:
         """``hulls``, ``T_box_base`` and ``halves`` of :class:`ProofScene`."""
         corners, pieces = np.concatenate(self._corners), zip(self._corners, self._rounded, strict=True)
         axes = by_axes(corners)
-        inner = np.concatenate([inscribed_prism(piece) if about else piece for piece, about in pieces])
+        inner = np.concatenate([inscribed_prism(piece) if rounded else piece for piece, rounded in pieces])
         count = len(self._boxes)
         boxes, arm = (enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
         centres, radii, slack, sizes, few, degrees = (
@@ -253,21 +248,17 @@ LEAF_TRIANGLES = 4
 class TriangleTree:
     """A heap of boxes: the children of node i are 2 i + 1 and 2 i + 2; the last level's nodes are the leaves."""
 
-    lows: Floats
-    """Shape (nodes, 3), mm: lowest corner of each node's box."""
-    highs: Floats
-    """Shape (nodes, 3), mm."""
+    lows: Floats  # shape (nodes, 3), mm: lowest corner of each node's box
+    highs: Floats  # shape (nodes, 3), mm
     corners: Floats
     """Shape (leaves, k, 3, 3), mm: the triangles of each leaf; some stand in two, so that all have k."""
-    rows: NDArray[np.int32]
-    """Shape (leaves, k): which of the mesh's triangles they are."""
+    rows: NDArray[np.int32]  # shape (leaves, k): which of the mesh's triangles they are
 
     @classmethod
     def of(cls, mesh: TriangleMesh, cache: Cache = NO_CACHE) -> TriangleTree:
         """The tree of a mesh that has been checked: finite, not empty.
 
-        Args:
-            cache: Where its leaves are kept. What costs little to make from them is not: it is six times as large.
+        Its leaves are cached. What costs little to make from them is not: it is six times as large.
         """
         made_from = {"what": "leaves", "surface": mesh.digest}
         return cache.value(made_from, lambda: _leaves(mesh), partial(cls._of_leaves, mesh), by=__name__)
@@ -322,17 +313,12 @@ def _check_leaves(mesh: TriangleMesh, leaves: Arrays) -> None:
 
 FIELD_MARGIN_MM = 500.0
 """How far around the skin distances are kept: beyond, they are seldom needed."""
-
 MOST_CELLS = 4_000_000
 """Cells of that field at most (16 MB): a larger skin gets a narrower margin."""
 
 
 def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache) -> SkinTree:
-    """The skin's tree and its field, of which nothing is known yet; or some that no check wants.
-
-    Args:
-        patient: The skin, and behind it what the CT shows besides.
-    """
+    """The tree of skin and what the CT shows behind it, and a field of which nothing is known yet; or empty ones."""
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
         return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3), np.zeros((1, 1), np.bool_))

@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.collision.bodies import finer_prism
+from puncture_twin.planning.collision.bodies import Check
 from puncture_twin.planning.collision.kernels import proofs as proof_kernels, settled as settled_kernels
 from puncture_twin.planning.collision.kernels.proofs import ProofScene, proof_scratch
 from puncture_twin.planning.collision.kernels.surfaces import STACK
@@ -30,7 +30,7 @@ from puncture_twin.planning.collision.packed import (
     packed_skin,
     packed_trees,
 )
-from puncture_twin.planning.collision.patient import Check
+from puncture_twin.planning.collision.spheres import finer_prism
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
@@ -47,15 +47,13 @@ class Around(NamedTuple):
 
     touching: Bools
     """Shape (m, k): at the state itself the reference must be queried, and is likely to find that something touches."""
-    unproven: Bools
-    """Shape (m, k): the checks open about each state."""
+    unproven: Bools  # shape (m, k): the checks open about each state
 
 
 class NotClear(NamedTuple):
     """The first check of each state that is not proven clear."""
 
-    checks: Ints
-    """Shape (m,); -1 where all is clear."""
+    checks: Ints  # shape (m,); -1 where all is clear
     answers: Ints
     """Shape (m,): what it comes to, see :mod:`puncture_twin.planning.collision.kernels.settled`."""
 
@@ -87,8 +85,8 @@ class Proofs:
             frame = check.second_body.frame
             if check.hulls is None:
                 body = check.second_body
-                about = hulls.add(finer[body.name], body) if body.name in finer else -1
-                row = (proof_kernels.SKIN, about, roots[body.name], WORKCELL_FRAME, frame)
+                round_row = hulls.add(finer[body.name], body) if body.name in finer else -1
+                row = (proof_kernels.SKIN, round_row, roots[body.name], WORKCELL_FRAME, frame)
             elif check.first_body is None:
                 second = hulls.add(check.hulls[1], check.second_body)
                 row = (proof_kernels.BOX, hulls.box(check.contact.other), second, WORKCELL_FRAME, frame)
@@ -120,11 +118,9 @@ class Proofs:
     def unproven(
         self, motion: Motion, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
     ) -> Iterator[tuple[int, int]]:
-        """The states of a path, in order, each with the checks, in order, that are not proven clear there.
+        """The states of a path, each with the checks, in order, that are not proven clear there.
 
-        Args:
-            tested: Shape (k,): which checks.
-            clear_mm: What the distance must exceed.
+        Of the ``tested`` (k,) ones; the distance must exceed ``clear_mm``.
         """
         due = np.zeros(len(self), np.int64)
         arguments = (self.scene, self._levers, tuple(motion), self._work, due, tested, clear_mm)
@@ -167,10 +163,8 @@ Touches = Callable[[int, Floats], bool]
 
 JOINTS_BETWEEN = 2
 """Such pairs see two angles alone, whose square can be searched in full; a cube of three would take too long."""
-
 HALVINGS = 9
 """Halvings of the square of a whole turn each way: down to 0.7 deg, where a UR3's pieces move by about 2 mm."""
-
 QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 """Where the middles of a square's quarters lie, in half sides of the square."""
 
@@ -178,8 +172,7 @@ QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, cache: Cache) -> tuple[Check, ...]:
     """The checks without pairs that touch at no angle; the proofs are made to test these.
 
-    Args:
-        cache: Where the answer is kept: it depends on arm and tool alone.
+    The answer is cached: it depends on arm and tool alone.
     """
     between = proofs.joint_spans[:, 0] > 0
     pairs = [check.hulls or () for check, pair in zip(checks, between, strict=True) if pair]
@@ -202,8 +195,7 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
 def never_touching(model: UrModel, proofs: Proofs, touches: Touches) -> Bools:
     """Which checks of a cell (k,) are proven clear at every angle: squares of angles, quartered until each is proven.
 
-    Args:
-        touches: Called where enclosures overlap: whether a check's bodies do, at frames (7, 4, 4).
+    Where enclosures overlap, ``touches`` says whether a check's bodies do, at frames (7, 4, 4).
     """
     never = np.zeros(len(proofs), np.bool_)
     spans = proofs.joint_spans

@@ -1,7 +1,6 @@
-"""The interface of collision checkers, what they return, and bounds on how far an arm's bodies move.
+"""What collision checkers return, and bounds on how far an arm's bodies move.
 
-Any checker may take another's place behind `StateChecker`. `SweptBodies` bounds the motion between two configurations:
-every sampled collision check rests on it.
+`SweptBodies` bounds the motion between two configurations: every sampled collision check rests on it.
 """
 
 from __future__ import annotations
@@ -11,20 +10,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import link_frames, link_poses
-from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.links import LINK_NAMES, collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
-from puncture_twin.planning.collision.bodies import BODY_NAMES
 
 PATIENT = "patient"
+
+BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
+"""The bodies of the arm, from the base on; not every arm has a tool."""
 
 
 class Contact(NamedTuple):
@@ -41,8 +42,7 @@ NEEDLE_IN_PATIENT = Contact("needle", PATIENT)
 class FirstContact(NamedTuple):
     """The first contact along a path: at which of its states, and of what."""
 
-    at: int
-    """Index of the state."""
+    at: int  # index of the state
     contact: Contact
 
 
@@ -57,63 +57,15 @@ class Nearest(NamedTuple):
 class Distances(NamedTuple):
     """Least distances of the arm, mm, 0 where it touches."""
 
-    patient: Nearest
-    """Moving links and holder to the skin."""
-    needle: Nearest
-    """Needle to the skin: 0 while it goes in."""
-    boxes: Nearest
-    """Moving links, holder and needle to the workcell's boxes."""
+    patient: Nearest  # moving links and holder to the skin
+    needle: Nearest  # needle to the skin: 0 while it goes in
+    boxes: Nearest  # moving links, holder and needle to the workcell's boxes
 
 
 DISTANCE_PAIRS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"patient": BODY_NAMES[1:-1], "needle": BODY_NAMES[-1:], "boxes": BODY_NAMES[1:]}
 )
 """The kinds of distance, by the fields of ``Distances``, and the bodies that each is measured from."""
-
-
-class StateChecker(Protocol):
-    """Checks configurations of one arm in one scene. A faster checker takes this one's place behind these names."""
-
-    @property
-    def model(self) -> UrModel:
-        """The arm."""
-
-    @property
-    def tool(self) -> Tool:
-        """The tool on the flange."""
-
-    @property
-    def swept(self) -> SweptBodies:
-        """The arm's moving bodies, to bound how far they move."""
-
-    def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
-        """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
-
-    def contacts(
-        self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
-    ) -> list[Contact | None]:
-        """First contact of each of many states (n, 6), rad.
-
-        Where ``round_clear`` (n,) says so, holder and needle are known to touch neither patient nor boxes.
-        """
-
-    def folded(self, q: Floats) -> Bools:
-        """Which of many states (n, 6), rad, have contact between links before the last joint: at any q6."""
-
-    def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
-        """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""
-
-    def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:
-        """One of ``DISTANCE_PAIRS`` at ``q``, shape (6,), rad; of one body alone when named."""
-
-    def distances(self, q: Floats) -> Distances:
-        """All kinds of distance at ``q``, shape (6,), rad."""
-
-    def sweep_mm(self, q_path: Floats) -> Floats:
-        """Bound on every body's motion along each segment of ``q_path`` (m, 6): shape (m - 1,), mm."""
-
-    def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
-        """Bound on each moving body's motion along each segment, by name."""
 
 
 def require_finite(q: Floats) -> None:
@@ -130,8 +82,7 @@ class SweptBodies:
     tool: Tool
     corners: Floats
     """Shape (6, 8, 3), mm: a box about each moving link in its frame, the last with all on the flange."""
-    longest_lever_mm: float
-    """No body point is ever farther from a joint's axis than this."""
+    longest_lever_mm: float  # no body point is ever farther from a joint's axis than this
 
     @classmethod
     def of(cls, model: UrModel, tool: Tool, padding_mm: float = 0.0) -> SweptBodies:

@@ -20,7 +20,6 @@ from puncture_twin.planning.collision.bodies import FLANGE_FRAME, Body, Shape, S
 
 STUB_MM = 1.0
 """A tool ends in a needle; the probe's handle ends in one so short that it is none."""
-
 FAR_LINKS = 5
 """The probe's head may touch the links from the base to wrist 1; the later ones turn behind it."""
 

@@ -28,10 +28,8 @@ from puncture_twin.planning.geometry.rigid import apply, pose
 ARM_PADDING_MM = 5.0
 """The arm keeps this distance from all around it: more than the registration's error, and enough to prove the path
 between two checked states."""
-
 CHECKER_BYTES = 20_000_000
 """About what the arm's links, hulls and spheres hold in one checker."""
-
 TREE_COPIES = 8
 """A surface in FCL's tree and in that of the proofs holds about so many times its vertices and faces."""
 
@@ -90,10 +88,9 @@ def own_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory)
 
 
 def home_configuration(case: Case) -> Floats:
-    """Joints of the waiting arm, shape (6,), rad: the case's, or arm up and wrist down.
+    """Joints of the waiting arm (6,), rad: the case's, or arm up and wrist down.
 
-    Raises:
-        InputError: It is beyond the arm's limits.
+    Raises InputError: It is beyond the arm's limits.
     """
     home = np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]) if case.robot.home is None else case.robot.home
     if not case.robot.model.within_limits(home):
@@ -105,7 +102,6 @@ def home_configuration(case: Case) -> Floats:
 GANTRY = "gantry"
 OF_CASE_FILE = "case file"
 """Source of the solids that the case file describes."""
-
 NOWHERE = (
     'obstacles of the frame "base" are not checked, because the case does not state where the robot\'s base is: {names}'
 )
@@ -128,12 +124,9 @@ def _gantry_boxes(gantry: Gantry, T_base_ct: Floats) -> tuple[Box, ...]:
 def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
     """Depth by which the skin reaches beyond the bore within the gantry's thickness, mm; 0 where it does not.
 
-    Decided about is each whole triangle and the round bore: the wall, and all that lies outward of it, is what is
-    farther from the axis than the bore's radius between the two planes of its faces. The distance from the axis is a
-    convex function, so of the part of a triangle between the planes a corner is farthest: a vertex, or where an edge
-    passes through a plane. A body that is in the wall anywhere has skin there or farther outward, also where the wall
-    lies wholly inside of it, and where the skin is open only its surface counts.
-
+    The wall, and all that lies outward of it, is farther from the axis than the round bore's radius, between the planes
+    of its faces. The distance from the axis is convex, so of the part of a triangle between the planes a corner is
+    farthest: a vertex, or where an edge passes through a plane. A body in the wall has skin there or farther outward.
     The checkers' boxes leave a bore up to 0.9 % narrower: a patient who fits the round one is not refused for that.
     """
     at = apply(np.linalg.inv(gantry.T_ct_gantry), skin.vertices)
@@ -178,9 +171,7 @@ def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) ->
 def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
     """Obstacles and gantry as structures of role ``avoid`` without a margin, CT frame.
 
-    Args:
-        T_base_ct: Shape (4, 4); None where nothing says where the arm is: obstacles of the frame ``base`` are then
-            nowhere, and are left out.
+    Without ``T_base_ct`` (4, 4) obstacles of the frame ``base`` are nowhere, and are left out.
     """
     T = np.eye(4) if T_base_ct is None else T_base_ct
     fixed = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "ct" or T_base_ct is not None}

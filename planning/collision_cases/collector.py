@@ -190,7 +190,7 @@ class CollisionItem(pytest.Item):
         session, table = session_of(self.config), self._table
         if table.kind != "plan":
             context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
-            self.user_properties += [("case", str(table.case)), (ARM_PROPERTY, context.arm)]
+            self.user_properties += [("case", str(table.case)), (ARM_PROPERTY, context.arm_note)]
         found = FINDERS[table.kind](session, table, self.path.parent)
         numbers = [one.number for one in found.differences if one.number is not None]
         if len(numbers) < len(found.differences) or (numbers and not updating(self.config)):

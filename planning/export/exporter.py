@@ -23,7 +23,7 @@ from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.text import Shown
-from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.export.program import (
     SampledMotion,
     check_program,
@@ -53,7 +53,7 @@ SAMPLES = 400
 """Along a segment, to find where the tip comes within the radius."""
 
 
-def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
+def blend_radii_mm(checker: CellChecker, waypoints: Floats) -> Floats:
     """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
 
     Args:
@@ -76,7 +76,7 @@ def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
     return radii
 
 
-def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
+def _fraction_within(checker: CellChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
     """The last fraction of the path from a corner at which the tip is still within a radius of it, or the next sample.
 
     1 where the tip is so near the other end, so that half of the distance between two tips bounds both radii.
@@ -90,7 +90,7 @@ def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radiu
     return float(fractions[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
 
 
-def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> Floats:
+def _triangle(checker: CellChecker, corner: Floats, back: Floats, ahead: Floats) -> Floats:
     """States of a triangle, (m, 6), in rays from its corner: neighbours on a ray or across are within ``GRID_MM``."""
     rays, steps = 1, 1
     while True:
@@ -159,7 +159,7 @@ class _Draft(NamedTuple):
 
 
 def export_plan(
-    plan: Plan, format_name: str, folder: Path, *, source: Path, checker: StateChecker | None = None
+    plan: Plan, format_name: str, folder: Path, *, source: Path, checker: CellChecker | None = None
 ) -> Exported:
     """Write a plan for a robot.
 
@@ -186,7 +186,7 @@ def export_name(source: Path, format_name: str) -> str:
     return f"{source.stem}{format_of(format_name)[0]}"
 
 
-def _urscript(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
+def _urscript(plan: Plan, source: Path, checker: CellChecker | None) -> _Draft:
     rows = waypoint_rows(plan)
     waypoints = plan.approach.q[rows]
     blends = None if checker is None or len(rows) < 3 else blend_radii_mm(checker, waypoints)
@@ -200,7 +200,7 @@ def _urscript(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
     return _Draft(text, (f"{len(program.moves)} joint moves, {rounded} of them rounding a corner{why}",))
 
 
-def _ros2(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
+def _ros2(plan: Plan, source: Path, checker: CellChecker | None) -> _Draft:
     text, model = ros2_text(plan, case_checked=checker is not None), plan.model
     check_sampled(read_ros2(text, model, where=source), plan, time_resolution_s=TIME_RESOLUTION_S, where=source)
     return _Draft(text, ("two messages: send 'insertion' only when the operator says so",))
@@ -219,14 +219,14 @@ class Exporter(NamedTuple):
     """To which times are written."""
     notes: tuple[str, ...] = ()
 
-    def draft(self, plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
+    def draft(self, plan: Plan, source: Path, checker: CellChecker | None) -> _Draft:
         """The text, read back and equal to the plan."""
         text = self.write(plan, case_checked=checker is not None)
         check_sampled(self.read(text, where=source), plan, time_resolution_s=self.time_resolution_s, where=source)
         return _Draft(text, self.notes)
 
 
-Drafting = Callable[[Plan, Path, StateChecker | None], _Draft]
+Drafting = Callable[[Plan, Path, CellChecker | None], _Draft]
 
 FORMATS: Mapping[str, tuple[str, Drafting]] = MappingProxyType(
     {

@@ -62,10 +62,9 @@ def contains(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
 
 
 def inside_each(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of many points (n, 3) lie inside a closed surface, shape (n,); points on the surface fall to either side.
+    """Which of many points (n, 3) lie inside a closed surface, shape (n,); on it either way.
 
-    Raises:
-        ValueError: The surface is open.
+    Raises ValueError: The surface is open.
     """
     if not mesh.closed:
         raise ValueError("an open surface has no inside")
@@ -156,19 +155,20 @@ def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
 MOST_POLAR_BINS, LEAST_POLAR_BINS = 120, 2
 """Bins over the polar angle (1.5 degrees each) for many rays; twice as many over the azimuth. For few rays: of fewer
 bins a cone's window would hold some twice."""
-
 SAME_CROSSING_MM, USUAL_CROSSINGS = 1e-6, 4
 """Crossings of one ray closer than this are one: the ray runs through an edge or a corner. Space is made for so many of
 a ray before they are counted; for more, they are computed once again."""
-
 CONE_SLACK, OUTSIDE = 1e-9, 1e-12
 """Radians by which a bounding cone is widened against rounding; and by so much less than the cone's is the cosine of a
 ray that is outside of it whatever rounding did."""
-
+ALL_AROUND = 1.5
+"""Half-angle, rad, of a cone from which on all rays are visited: its window of bins would be nearly all of them."""
+NARROW_SUM, NARROW_COSINE = 0.3, 0.2
+"""A triangle has a narrow cone where the unit vectors to its corners add up to more than the first, and each is nearer
+to their mean than the second: so the cone is narrower than a half-space, whatever rounding does."""
 DOUBTFUL = 1e-12
 """A triangle seen so nearly edge-on that the part of its area across the ray is rounding: where on it the ray is
 crossed is not known."""
-
 NUDGE = 1e-7
 """Radians by which a ray through an edge or corner is rotated when its crossings are inconsistent."""
 
@@ -184,8 +184,7 @@ class Crossings:
     """1 where the ray comes out through the triangle's front (its corners run counterclockwise seen from there), -1
     where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded) or the triangle is
     seen edge-on."""
-    count: Ints
-    """Shape (n,), crossings of each ray."""
+    count: Ints  # shape (n,), crossings of each ray
     first: Ints
     """Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0)."""
 
@@ -267,13 +266,13 @@ def _visit(vertices, faces, origin, binned, length, ray, depth, face, sense):  #
         first_row = max(0, int((polar - radius) * per_radian))
         last_row = min(bins - 1, int((polar + radius) * per_radian))
         low, high = _azimuths(center, polar, radius, bins)
-        if radius >= 1.5:  # all bins, each once: in one piece, since most of them hold no ray
+        if radius >= ALL_AROUND:  # all bins, each once: in one piece, since most of them hold no ray
             first_row, last_row, low, high = 0, 0, 0, 0
-        least = -2.0 if radius >= 1.5 else np.cos(radius) - OUTSIDE
+        least = -2.0 if radius >= ALL_AROUND else np.cos(radius) - OUTSIDE
         for row in range(first_row, last_row + 1):
             for column in range(low, high + 1):
                 cell = row * 2 * bins + column % (2 * bins)
-                begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
+                begin, end = (0, len(order)) if radius >= ALL_AROUND else (starts[cell], starts[cell + 1])
                 for k in range(begin, end):
                     inside = _along(center, rays[k]) >= least * lengths[k]
                     t, out = _cross(a, b, c, rays[k]) if inside else (-1.0, 0)
@@ -315,12 +314,12 @@ def _off_cap(a, b, c, cap):  # type: ignore[no-untyped-def]  # numba infers
     """
     axis, cosine, sine = cap
     to_b, to_c = (b[0] - a[0], b[1] - a[1], b[2] - a[2]), (c[0] - a[0], c[1] - a[1], c[2] - a[2])
-    side2, away2 = max(_along(to_b, to_b), _along(to_c, to_c)), _along(a, a)
-    if 16.0 * side2 > away2:
+    side2, distance2 = max(_along(to_b, to_b), _along(to_c, to_c)), _along(a, a)
+    if 16.0 * side2 > distance2:
         return False
-    away, side = np.sqrt(away2), np.sqrt(side2)
-    least = cosine * away if cosine < 0.0 else cosine * (away - 8.5 * side2 / away)
-    return _along(a, axis) < least - sine * 4.1 * side - 3e-6 * away
+    distance, side = np.sqrt(distance2), np.sqrt(side2)
+    least = cosine * distance if cosine < 0.0 else cosine * (distance - 8.5 * side2 / distance)
+    return _along(a, axis) < least - sine * 4.1 * side - 3e-6 * distance
 
 
 @allocation_free()
@@ -351,12 +350,12 @@ def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
     y = a[1] / na + b[1] / nb_ + c[1] / nc
     z = a[2] / na + b[2] / nb_ + c[2] / nc
     norm = _length(x, y, z)
-    if norm < 0.3:
+    if norm < NARROW_SUM:
         return (0.0, 0.0, 1.0), np.pi
     x, y, z = x / norm, y / norm, z / norm
     to_a, to_b = (x * a[0] + y * a[1] + z * a[2]) / na, (x * b[0] + y * b[1] + z * b[2]) / nb_
     cosine = min(to_a, to_b, (x * c[0] + y * c[1] + z * c[2]) / nc)
-    if cosine < 0.2:
+    if cosine < NARROW_COSINE:
         return (0.0, 0.0, 1.0), np.pi
     return (x, y, z), np.arccos(min(1.0, cosine)) + CONE_SLACK + 1e-7
 
@@ -372,7 +371,7 @@ def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # n
 
     A circle of angular radius r about a point of polar angle p spans azimuths of +- asin(sin r / sin p), all at a pole.
     """
-    if radius >= 1.5 or polar - radius <= 0.0 or polar + radius >= np.pi:
+    if radius >= ALL_AROUND or polar - radius <= 0.0 or polar + radius >= np.pi:
         return 0, 2 * bins - 1
     half = np.arcsin(min(1.0, np.sin(radius) / np.sin(polar)))
     azimuth = np.arctan2(center[1], center[0]) + np.pi

@@ -35,10 +35,8 @@ UNSEEN = 1e-6
 class System(NamedTuple, Generic[X]):
     """A problem, linearised at an estimate."""
 
-    residuals: Floats
-    """Shape (m,), in standard deviations."""
-    slopes: Floats
-    """Shape (m, p): their derivative by the unknowns."""
+    residuals: Floats  # shape (m,), in standard deviations
+    slopes: Floats  # shape (m, p): their derivative by the unknowns
     cost: Callable[[X], float] | None = None
     """Sum of the squared residuals near the estimate, under its weights: a step that raises it is damped.
 
@@ -55,15 +53,11 @@ class Fit(NamedTuple, Generic[X]):
     """Result of Gauss-Newton."""
 
     estimate: X
-    system: System[X]
-    """Linearised where the last step began."""
-    step: Floats
-    """Shape (p,): the last step, in the unknowns' units; 0 where none was left to make."""
+    system: System[X]  # linearised where the last step began
+    step: Floats  # shape (p,): the last step, in the unknowns' units; 0 where none was left to make
     iterations: int
-    settled: bool
-    """Whether it arrived within the steps it was given."""
-    determined: bool
-    """Whether no unknown was left alone by the last step."""
+    settled: bool  # whether it arrived within the steps it was given
+    determined: bool  # whether no unknown was left alone by the last step
 
 
 def gauss_newton(
@@ -136,18 +130,13 @@ def _descend(
 class Lacking(NamedTuple):
     """Explanation of a linear model's residuals by k unknowns that it lacks."""
 
-    found: Floats
-    """Shape (k,): their values."""
-    sd: Floats
-    """Shape (k,): their standard deviations, by the residuals that they leave."""
+    found: Floats  # shape (k,): their values
+    sd: Floats  # shape (k,): their standard deviations, by the residuals that they leave
     probability: float
     """Chance of residuals that they explain so well, where all are zero: F(k, freedom)."""
-    freedom: int
-    """Residuals less p and k."""
-    variance: float
-    """Of one residual, with them."""
-    variance_without: float
-    """Of one residual, in the model without them."""
+    freedom: int  # residuals less p and k
+    variance: float  # of one residual, with them
+    variance_without: float  # of one residual, in the model without them
 
 
 def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> Lacking | None:

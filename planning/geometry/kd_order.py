@@ -9,10 +9,8 @@ from puncture_twin.planning.base.numba_kernels import nb
 
 STACK = 128
 """Ranges still to split: one per level, and 2^64 points have 64 levels."""
-
 SAMPLED = 128
 """Points of a range for each one in the sample that a pivot is chosen from; the sample has three more."""
-
 MOST_SAMPLED = 63
 """Largest sample: to sort more costs as much as the better pivot saves."""
 
@@ -112,9 +110,8 @@ def _expected(records, sample, low, high, middle, axis):  # type: ignore[no-unty
 def _part(records, rows, low, high, axis, pivot, equal):  # type: ignore[no-untyped-def]  # numba infers
     """Move what lies below a pivot, or equals it, to the front of a range; returns where the rest begins.
 
-    Every record is swapped with the first of the rest, and only the border's step depends on its value: there is no
-    branch to mispredict. ``rows`` are the records as integers, so that copies keep their bits; unsigned indices need no
-    test for negative ones.
+    Every record is swapped with the first of the rest, and only the border's step depends on its value: no branch is
+    mispredicted. ``rows`` are the records as integers, so that copies keep their bits; unsigned indices need no test.
     """
     border = np.uint64(low)
     for i in range(np.uint64(low), np.uint64(high)):

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats, is_frozen
+from puncture_twin.planning.base.arrays import Floats, is_frozen, read_only
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.geometry.rigid import apply
@@ -21,13 +21,11 @@ Faces = NDArray[np.int32]
 
 MIXED = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers without a pattern: weights of a place's coordinates, as bits, in a sum that tells nearly all apart."""
-
 BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 BOX_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 BOX_FACES = np.array([triangle for a, b, c, d in BOX_SIDES for triangle in ((a, b, c), (a, c, d))])
 """Corners (8, 3) of the unit cube about the origin; its sides, corners in order, seen from outside to the left; and
 these as triangles, (12, 3)."""
-
 MOST_IN_ONE = 2_000_000
 """So many places give triples that fit in 63 bits."""
 
@@ -118,9 +116,7 @@ class TriangleMesh(Shown):
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the axis-aligned box, shape (2, 3), mm."""
-        bounds = box_of(self.vertices)
-        bounds.setflags(write=False)
-        return bounds
+        return read_only(box_of(self.vertices))
 
     @property
     def areas(self) -> Floats:
@@ -245,11 +241,7 @@ def packed_meshes(meshes: Sequence[TriangleMesh]) -> dict[str, NDArray[Any]]:
 
 
 def unpacked_meshes(arrays: dict[str, NDArray[Any]]) -> tuple[TriangleMesh, ...]:
-    """The meshes of `packed_meshes`, equal to the bit.
-
-    Raises:
-        KeyError, ValueError: These arrays are none.
-    """
+    """The meshes of `packed_meshes`, equal to the bit. Raises KeyError, ValueError: These arrays are none."""
     ends = np.cumsum(arrays["sizes"], axis=0)[:-1]
     vertices, faces = np.split(arrays["vertices"], ends[:, 0]), np.split(arrays["faces"], ends[:, 1])
     for some, corners in zip(vertices, faces, strict=True):
@@ -260,7 +252,6 @@ def unpacked_meshes(arrays: dict[str, NDArray[Any]]) -> tuple[TriangleMesh, ...]
 
 CREASE = np.radians(60.0)
 """Two triangles at a larger angle are faces of a thing with an edge. Steps of a meshed voxel mask stay below (55)."""
-
 COHERENT = 0.5
 """Fraction of the areas about a corner that their sum keeps at least, where they are one side of a smooth surface. Of
 triangles given both ways round, or wound against each other, it keeps less: their blend is no normal."""

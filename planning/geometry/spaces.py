@@ -46,11 +46,7 @@ def point_text(point_ct: Floats, space: Space) -> str:
 
 
 def parse_space(text: str, *, where: str) -> Space:
-    """The space that a text names; upper and lower case are the same.
-
-    Raises:
-        InputError: If it names none.
-    """
+    """The space that a text names, in upper or lower case. Raises InputError: It names none."""
     found = {space.lower(): space for space in Space}.get(text.strip().lower())
     return found or refuse(f"unknown space {text!r}", where, ", ".join(Space), "unknown_space")
 
@@ -69,11 +65,7 @@ class Unit(StrEnum):
 
 
 def parse_unit(text: str, *, where: str) -> Unit:
-    """The unit of length that a text names.
-
-    Raises:
-        InputError: If it names none.
-    """
+    """The unit of length that a text names. Raises InputError: It names none."""
     if text.strip() not in tuple(Unit):
         refuse(f"unknown unit of length {text!r}", where, ", ".join(Unit), "unknown_unit")
     return Unit(text.strip())

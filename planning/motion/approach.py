@@ -20,7 +20,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
-from puncture_twin.planning.collision.state_checker import Contact, StateChecker
+from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.motion import shortest
 from puncture_twin.planning.motion.follow import follow, rounded
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
@@ -41,8 +41,7 @@ CURVE_PIECES = 8
 class Approach:
     """A collision-free motion from home to a standoff pose, with the needle outside the patient."""
 
-    waypoints: Floats
-    """Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal."""
+    waypoints: Floats  # shape (k, 6), rad, k >= 2: straight joint segments from home to the goal
     cuts: Floats
     """Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there."""
     trajectory: Trajectory
@@ -59,7 +58,7 @@ class Approach:
 
 
 def plan_approach(
-    checker: StateChecker,
+    checker: CellChecker,
     q_home: Floats,
     q_goals: Floats,
     *,
@@ -104,7 +103,7 @@ def plan_approach(
 class _Ends:
     """Home and goals of an approach; which goals are free or cut off from home is computed when first needed."""
 
-    def __init__(self, checker: StateChecker, home: Floats, goals: Floats) -> None:
+    def __init__(self, checker: CellChecker, home: Floats, goals: Floats) -> None:
         self.checker, self.home, self.goals = checker, home, goals
 
     @cached_property
@@ -117,10 +116,8 @@ class _Ends:
         return np.flatnonzero([contact is None for contact in contacts])
 
     @cached_property
-    def cut(self) -> shortest.Cut | None:
-        """The proof of which free goals are cut off from home; None for a checker whose boxes are not known."""
-        if not isinstance(self.checker, CellChecker):
-            return None
+    def cut(self) -> shortest.Cut:
+        """The proof of which free goals are cut off from home."""
         points, goals = self.checker.points_of(shortest.UPPER_ARM), self.goals[self.open_goals]
         return shortest.Cut(self.checker.model, self.checker.boxes, points, self.home, goals)
 
@@ -134,7 +131,7 @@ def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: i
     return path if isinstance(path, Connected) else path._replace(goal_index=int(ends.open_goals[path.goal_index]))
 
 
-def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentContact:
+def _segment_check(checker: CellChecker, resolution_rad: float) -> SegmentContact:
     if isinstance(checker, FastChecker):
         return checker.segment_checker()
 
@@ -168,8 +165,8 @@ def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
 def _why_none(found: Connected, ends: _Ends, seed: int) -> str:
     cut, n_goals, n_free = ends.cut, len(ends.goals), len(ends.open_goals)
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
-    n_off = 0 if cut is None else int(cut.off.sum())
-    if cut is not None and n_off == n_free:
+    n_off = int(cut.off.sum())
+    if n_off == n_free:
         return f"approach proven impossible: {cut.text}{busy}"
     where = "the goals are" if found.goal_states <= found.home_states else "home is"
     trees = f"{found.home_states} states joined home, {found.goal_states} the goals"

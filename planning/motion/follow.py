@@ -29,7 +29,6 @@ from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 MAX_JERK = 14.0
 """rad/s^3, of every joint: a UR's acceleration of 1.4 rad/s^2 is reached in a tenth of a second. No manual states a
 limit; this is for the needle, which swings after every jolt."""
-
 STANDSTILL_RAD = 1e-12
 """A segment on which no joint turns farther is no motion: rounding."""
 SAME_STEP = 1e-9
@@ -37,7 +36,6 @@ SAME_STEP = 1e-9
 TIP_STEP_RAD = 0.005
 """rad between the samples at which the tip's speed along a path is computed; between two of them it rises by at most
 5e-5 of what the arm's whole reach would have: h^2 / 8 times the second derivative."""
-
 TIP_FRACTION = 0.999
 """Fraction of the tip's speed limit that is used: what samples may miss."""
 TINY = 1e-30
@@ -264,8 +262,7 @@ class TimeLaw(NamedTuple):
 
     length: float
     duration_s: float
-    profile: Profile | None
-    """Ruckig's; None where the speed is constant."""
+    profile: Profile | None  # ruckig's; None where the speed is constant
 
     def travelled(self, times_s: Floats) -> Floats:
         """The length run at some times (m,) from 0 to ``duration_s``."""
@@ -284,12 +281,7 @@ class TimeLaw(NamedTuple):
 
 
 def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: float = 0.0) -> TimeLaw:
-    """The fastest motion over a length, without acceleration at either end.
-
-    Args:
-        length: Above 0.
-        end_speed: Speed at the end, reachable (:func:`reachable_speed`).
-    """
+    """The fastest motion over a length above 0, without acceleration at either end, to a `reachable_speed`."""
     task = InputParameter(1)
     task.current_position, task.current_velocity, task.current_acceleration = [0.0], [start_speed], [0.0]
     task.target_position, task.target_velocity, task.target_acceleration = [length], [end_speed], [0.0]

@@ -8,21 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.state_checker import DISTANCE_PAIRS, Contact, Distances, Nearest, StateChecker
+from puncture_twin.planning.collision.state_checker import DISTANCE_PAIRS, Contact, Distances, Nearest
 
 RESOLUTION_RAD = 0.05
 """Joint distance of the states at which FCL alone checks a segment: up to 50 mm at a metre, never the last word."""
 FINER = 10
 """The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
 its states."""
-
 MAX_SWEEP_MM = 2.0
 """So fine that no body point moves farther between two checked states."""
 CLEARANCE_STEP_MM = 1.0
 """The least clearance is found to this: states that cannot improve on it by more are passed over."""
-
-
 ROUGHLY_MM = 10.0
 """To this the least clearance is sought first; then a fast checker passes over what it proves to be no nearer."""
 _At = tuple[int, float]
@@ -36,7 +34,7 @@ def path_length(waypoints: Floats) -> float:
     return float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
 
 
-def dense_states(checker: StateChecker, waypoints: Floats, step_rad: float) -> Floats:
+def dense_states(checker: CellChecker, waypoints: Floats, step_rad: float) -> Floats:
     """States along a path, so close that neither joint distance nor any body's motion exceeds its bound.
 
     Shape (m, 6), rad, all waypoints (k, 6) among them. ``MAX_SWEEP_MM`` bounds the motion of the bodies.
@@ -62,13 +60,13 @@ def path_states(waypoints: Floats, counts: NDArray[np.int64]) -> Floats:
     return np.concatenate([rows, waypoints[-1:]])
 
 
-def first_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
+def first_contact(checker: CellChecker, q_path: Floats) -> Contact | None:
     """The first contact along states (m, 6), the needle being outside the patient; None if all are free."""
     first = checker.first_contact(q_path, needle_may_touch_patient=False)
     return None if first is None else first.contact
 
 
-def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
+def least_clearance(checker: CellChecker, q_path: Floats) -> Distances:
     """The least of each distance over states (m, 6) along a path, to ``CLEARANCE_STEP_MM``."""
     path = _Path(checker, np.asarray(q_path, dtype=np.float64))
     return Distances(*(path.least(pair) for pair in DISTANCE_PAIRS))
@@ -77,7 +75,7 @@ def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
 class _Path:
     """States whose distances are measured. A body's distance changes by no more than the body moves."""
 
-    def __init__(self, checker: StateChecker, q: Floats) -> None:
+    def __init__(self, checker: CellChecker, q: Floats) -> None:
         self._checker, self._q = checker, q
         sweeps = checker.body_sweeps_mm(q)
         self._moved = {body: np.concatenate([[0.0], np.cumsum(sweep)]) for body, sweep in sweeps.items()}

@@ -41,25 +41,18 @@ class Connected(NamedTuple):
 
     waypoints: Floats | None
     """Shape (k, 6), rad: from home exactly to a goal exactly; None if it found no path."""
-    goal_index: int
-    """Which goal; -1 without a path."""
-    home_states: int
-    """How many states the tree from home has."""
-    goal_states: int
-    """How many the one from the goals has."""
-    samples: int
-    """How many samples it took."""
-    blocked: Counter[Contact]
-    """What its segments touched, and how often."""
+    goal_index: int  # which goal; -1 without a path
+    home_states: int  # how many states the tree from home has
+    goal_states: int  # how many the one from the goals has
+    samples: int  # how many samples it took
+    blocked: Counter[Contact]  # what its segments touched, and how often
 
 
 class Limits(NamedTuple):
     """Sampling box and stopping rule of a run."""
 
-    bounds: Floats
-    """Shape (6, 2), rad: where samples are drawn; home and goals lie in it."""
-    max_samples: int
-    """After so many the planner gives up."""
+    bounds: Floats  # shape (6, 2), rad: where samples are drawn; home and goals lie in it
+    max_samples: int  # after so many the planner gives up
     shorter_than: float = math.inf
     """States through which no path to a goal is shorter than this, rad, are passed over unchecked."""
 
@@ -73,12 +66,9 @@ def connect(
     seed: int,
     clear_of: SegmentContact | None = None,
 ) -> Connected:
-    """Plan from home to any of several goals, and shorten what was found.
+    """Plan from home (6,) to any of several goals (g, 6), free, rad, and shorten what was found.
 
-    Home (6,) and goals (g, 6) are free, rad.
-
-    Args:
-        clear_of: Checks a shortcut; ``contact_of`` unless stated.
+    ``clear_of`` checks a shortcut; ``contact_of`` unless stated.
 
     Raises:
         NoAnswerError: If the planner's path does not join home and a goal.
@@ -167,7 +157,6 @@ def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Fl
 SegmentContact = Callable[[Floats, Floats], Contact | None]
 """Contact of the straight joint segment between two states (6,); None when it is free, its end included. Of a
 segment that begins at a state known to be free the check gets that state first."""
-
 Angles = tuple[float, ...]
 """Six joint angles, rad."""
 WRIST_DIVISOR = 2.0
@@ -177,11 +166,7 @@ SEEDS = 2**31 - 1
 
 
 class JointSpace:
-    """A box of joint angles as OMPL sees it.
-
-    Args:
-        wrist_divisor: What the wrist's angles are divided by; a power of two.
-    """
+    """A box of joint angles as OMPL sees it, those of the wrist divided by a power of two."""
 
     def __init__(self, bounds: Floats, wrist_divisor: float = WRIST_DIVISOR) -> None:
         self._divisors = np.array([1.0, 1.0, 1.0, wrist_divisor, wrist_divisor, wrist_divisor])
@@ -232,21 +217,12 @@ STEPS = 60
 CLEARANCE_MM = 20.0
 """What a shortcut keeps from patient and boxes beyond the arm's padding, where both of its ends do. The shortest path
 round an obstacle runs along it, and then an arm that errs by more than the padding touches."""
-
 UNSCALED = 1.0
 """What the wrist's angles are divided by here: nothing."""
 
 
 def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Floats) -> Floats:
-    """A path with the same ends that is no longer, with every joint counted in full.
-
-    Args:
-        joint_limits: Shape (6, 2), rad.
-        waypoints: Shape (k, 6), rad: straight free segments.
-
-    Returns:
-        Shape (m, 6), rad.
-    """
+    """A path (m, 6), rad, with the same ends, no longer with every joint counted in full, of free segments (k, 6)."""
     space = JointSpace(joint_limits, UNSCALED)
     space.set_up(_ShortcutValidator(space.information, contact_of))
     path = og.PathGeometric(space.information)

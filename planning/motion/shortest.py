@@ -30,11 +30,9 @@ from puncture_twin.planning.motion.rrt_connect import Connected, Limits, Segment
 MAX_SAMPLES = 8000
 """Samples of the first run; half of them near home and goals. Next to the body tens of them do, at a gantry
 some hundred."""
-
 NEAR_RAD = math.pi
 """How far beyond the angles of home and goals a joint may turn while half of the samples are drawn: half a turn. The
 limits of most joints are two whole turns apart, and a way round oneself is seldom needed."""
-
 PATIENCE, LEAST_SAMPLES = 4, 500
 """A run for a shorter path gets so many times the samples that the first one took, or at least so many."""
 RUNS = 3
@@ -58,27 +56,19 @@ class Path(NamedTuple):
 class Task(NamedTuple):
     """A planning problem: ends, limits and checks of a path."""
 
-    joint_limits: Floats
-    """Shape (6, 2), rad."""
+    joint_limits: Floats  # shape (6, 2), rad
     contact_of: SegmentContact
-    home: Floats
-    """Shape (6,), rad, free."""
-    goals: Floats
-    """Shape (g, 6), rad, free."""
-    cut: Cut | None = None
-    """Tells which of the goals are cut off from home."""
-    clear_of: SegmentContact | None = None
-    """Checks a shortcut; None for the check of a segment."""
+    home: Floats  # shape (6,), rad, free
+    goals: Floats  # shape (g, 6), rad, free
+    cut: Cut | None = None  # tells which of the goals are cut off from home
+    clear_of: SegmentContact | None = None  # checks a shortcut; None for the check of a segment
 
 
 def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path | None:
     """The straight path to the nearest goal that has a free one, where no other goal is worth a search; else None.
 
-    It ends where its check has found no contact: whether goals are free need not be known.
-
-    Args:
-        home: Shape (6,), rad, free.
-        goals: Shape (g, 6), rad.
+    From home (6,), free, to goals (g, 6), rad. It ends where its check has found no contact: whether goals are free
+    need not be known.
     """
     away = _distances(home, goals)
     found = _straight(contact_of, home, goals, away)
@@ -163,11 +153,7 @@ SAME_ANGLE = 1e-9
 
 
 class Cut:
-    """Which goals are cut off from home, and by which boxes; found when it is first needed.
-
-    Args:
-        points: Shape (p, 3), mm: points within the upper arm, in its frame.
-    """
+    """Which goals are cut off from home, and by which boxes, as points (p, 3), mm, of the upper arm's frame show."""
 
     def __init__(self, model: UrModel, boxes: Sequence[Box], points: Floats, home: Floats, goals: Floats) -> None:
         self._model, self._boxes, self._home, self._goals = model, boxes, home, goals
@@ -196,7 +182,7 @@ class Cut:
         """Shape (m, n): of each cell the row of a box that the upper arm is in all over it; -1 where none is proven."""
         middles = [(edges[1:] + edges[:-1]) / 2.0 for edges in self._edges]
         halves = [float(np.diff(edges).max()) / 2.0 for edges in self._edges]
-        (first, first_rows), (second, second_rows) = (_unturned(middle) for middle in middles)
+        (first, first_rows), (second, second_rows) = (_modulo_turns(middle) for middle in middles)
         q = np.zeros((len(first), len(second), 6))
         q[..., 0], q[..., 1] = first[:, None], second
         poses = link_poses(self._model, q.reshape(-1, 6))
@@ -225,7 +211,7 @@ class Cut:
         return int(self._parts[cell[0], cell[1]])
 
 
-def _unturned(angles: Floats) -> tuple[Floats, Ints]:
+def _modulo_turns(angles: Floats) -> tuple[Floats, Ints]:
     """Distinct angles modulo whole turns, and the index of each angle's."""
     turns = np.round((angles % (2.0 * np.pi)) / SAME_ANGLE).astype(np.int64)
     _, rows, which = np.unique(turns, return_index=True, return_inverse=True)

@@ -17,12 +17,9 @@ SAMPLE_S = 0.008
 class Peaks(NamedTuple):
     """The highest rates of each joint, by differences of the samples, from rest to rest; each of shape (6,)."""
 
-    speed: Floats
-    """rad/s."""
-    acceleration: Floats
-    """rad/s^2."""
-    jerk: Floats
-    """rad/s^3."""
+    speed: Floats  # rad/s
+    acceleration: Floats  # rad/s^2
+    jerk: Floats  # rad/s^3
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +53,6 @@ class Trajectory:
     def at(self, time_s: Floats | float) -> Floats:
         """Joint angles (..., 6) at a time, or at many (...), clamped to the ends."""
         return np.stack([np.interp(time_s, self.times_s, self.q[:, joint]) for joint in range(6)], axis=-1)
-
-    def max_speeds(self) -> Floats:
-        """The highest speed of each joint, shape (6,), rad/s."""
-        return self.peaks().speed
 
     def peaks(self) -> Peaks:
         """The highest speed, acceleration and jerk of each joint.

@@ -38,10 +38,9 @@ from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.collision import workcell
-from puncture_twin.planning.collision.bodies import Solid, connected_parts
+from puncture_twin.planning.collision.bodies import FclSkin, Solid, connected_parts
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.patient import FclSkin
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, patient_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
@@ -55,8 +54,8 @@ from puncture_twin.planning.place.mounts import (
     regions,
     wanted_directions,
 )
-from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.reach.survey import ReachAnswer, ReachRequest
+from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
+from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import Placement, default_method

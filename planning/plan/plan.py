@@ -14,7 +14,6 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, least_clearance
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.uncertainty.guided import WayChance
@@ -99,7 +98,7 @@ CLEARANCE_TEXT = MappingProxyType(
 """What each of a plan's clearances is of."""
 
 
-def phase_clearances(plan: Plan, checker: StateChecker) -> dict[str, float]:
+def phase_clearances(plan: Plan, checker: CellChecker) -> dict[str, float]:
     """How near arm and holder come to patient and workcell in each phase of the stored motion; mm."""
     found = {}
     for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):

@@ -41,7 +41,7 @@ MOST_STATES = 100_000
 ROLL_TOLERANCE_RAD = 1e-4
 """How far the stated roll may be from that of the joint angles: what the pose's tolerance lets the flange turn."""
 ANGLE_ROUNDING = 1e-12
-"""Share of a turn by which degrees and radians round."""
+"""Fraction of a turn by which degrees and radians round."""
 SPEED_ROUNDING = 1e-3
 """A time law that just keeps a speed may exceed it by its sampling."""
 AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and joint angles must agree"
@@ -220,17 +220,12 @@ def same_arm(one: UrModel, other: UrModel) -> bool:
 
 SAME_DIRECTION = 1e-6
 """Largest difference of two unit vectors that name one direction: degrees in the file are rounded to 1e-15."""
-
-
 SAME_NUMBER_MM = 1e-4
 """A number that is computed again may differ by this: FCL's own threshold."""
 
 
 def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None = None) -> Candidates:
-    """Check a loaded plan's direction and motion anew.
-
-    Args:
-        seed: That the plan must state: the command ``plan`` takes the case's. None where code chose another.
+    """Check a loaded plan's direction and motion anew, and that it states ``seed``, where one is given.
 
     Raises:
         InputError: The inputs changed, the direction is not safe any more, or the motion touches something.

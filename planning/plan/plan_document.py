@@ -50,7 +50,7 @@ INPUT_NAMES = ("role", "path", "sha256")
 SAME_TIME_S = 1e-9
 """Rounding of the samples' times."""
 SAME_PEAK = 1e-6
-"""Share by which a stated peak may differ from the samples' own: rounding."""
+"""Fraction by which a stated peak may differ from the samples' own: rounding."""
 MAX_PLAN_BYTES = 50_000_000
 """A plan is some thousand waypoints; a larger file is something else."""
 

@@ -19,8 +19,7 @@ from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.plan.plan import Plan, motion_contact, phase_clearances
-from puncture_twin.planning.reach.reach import approach_goals
-from puncture_twin.planning.reach.survey import ReachAnswer
+from puncture_twin.planning.reach.reach import ReachAnswer, approach_goals
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import BEST, Choice, choose
 from puncture_twin.planning.search.constraints import reach_request

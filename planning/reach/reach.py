@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,24 +18,55 @@ from puncture_twin.planning.arm.insertion import first_stop, needle_lines, reach
 from puncture_twin.planning.arm.inverse_kinematics import inverse, pan_angle, wrapped_solutions, wrist_angles
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, away_from_singularities, singularity
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.bodies import BODY_NAMES
-from puncture_twin.planning.collision.state_checker import Contact, StateChecker
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.state_checker import BODY_NAMES, Contact
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.reach.survey import (
     MARGIN_DIGITS,
     MAX_SWEEP_MM,
     Insertion,
-    ReachAnswer,
     ReachRequest,
     Surveyed,
     every_branch,
     sampled,
     surveyed,
 )
+
+
+@dataclass(frozen=True, eq=False)
+class ReachAnswer:
+    """Whether and how the arm reaches along one direction."""
+
+    reachable: bool
+    reason: Reason
+    """``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``."""
+    depth_mm: float | None
+    """How far the needle was inserted from standoff when it was blocked; None for other reasons."""
+    detail: str  # one sentence for people: what touched what, or what was missing; empty when reachable
+    contact: Contact | None  # what touched what, where that was the reason
+    roll: float  # turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable
+    branch: int  # index among the eight branches of ``inverse``; -1 when not reachable
+    insertion_q: Floats
+    """Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable."""
+    insertion_depth_mm: Floats  # shape (m,), mm inserted from standoff at each row
+    margin: float
+    """0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the three
+    singularity terms. 0 when not reachable."""
+
+    @classmethod
+    def refused(
+        cls, reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None
+    ) -> ReachAnswer:
+        """The answer for a direction that the arm does not reach, or not to the target."""
+        return cls(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)
+
+    def __post_init__(self) -> None:
+        self.insertion_q.setflags(write=False)
+        self.insertion_depth_mm.setflags(write=False)
 
 
 def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAnswer:
@@ -59,13 +90,12 @@ def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAn
 
 ROLLS = 8
 """Rolls about the needle that are tried, evenly over the turn."""
-
 CHUNK = 256
 """Requests between two reports of progress."""
 
 
 def assess_reach_all(
-    checker: StateChecker, requests: Sequence[ReachRequest], progress: Count | None = None, *, n_rolls: int = ROLLS
+    checker: CellChecker, requests: Sequence[ReachRequest], progress: Count | None = None, *, n_rolls: int = ROLLS
 ) -> list[ReachAnswer]:
     """Find, for each direction, a roll and a branch that reach the standoff pose and insert straight, untouched.
 
@@ -84,7 +114,7 @@ def assess_reach_all(
     return answers
 
 
-def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
+def every_reach(checker: CellChecker, request: ReachRequest) -> list[ReachAnswer]:
     """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first."""
     found = _surveyed(checker, [request], ROLLS)[0]
     motions = [*found.insertions()]
@@ -95,42 +125,26 @@ def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswe
     return [answer for answer in answers if isinstance(answer, ReachAnswer)]
 
 
-def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
+def _answers(checker: CellChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
     """The reach answer of each request; round by round the next motion of all that have none yet."""
     surveys = _surveyed(checker, requests, n_rolls)
-    search, first = FirstClear(surveys), True
-    while len((motions := search.next_motions()).rows):
-        clear = motions.round_clear
-        search.take(
-            checker, motions, checker.contacts(motions.standoffs, needle_may_touch_patient=False, round_clear=clear)
-        )
-        if first:
-            search.drop_folded(checker)
-        first = False
+    search = FirstClear(checker, surveys)
+    if search.goes_on:
+        search.try_next()
+        search.drop_folded()
+    while search.goes_on:
+        search.try_next()
     return [
         refusal(checker.model, found, deepest) if answer is None else answer
         for found, answer, deepest in zip(surveys, search.answers, search.deepest, strict=True)
     ]
 
 
-def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[Surveyed]:
+def _surveyed(checker: CellChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[Surveyed]:
     targets = np.array([request.target_base for request in requests])
     outwards = np.array([request.outward_base for request in requests])
     rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls
     return surveyed(checker.model, requests, needle_lines(targets, outwards), rolls)
-
-
-class NextMotions(NamedTuple):
-    """The next motion to try of each request whose search goes on."""
-
-    rows: Ints
-    """Shape (m,): which requests."""
-    branches: Ints
-    rolls: Ints
-    standoffs: Floats
-    """Shape (m, 6), rad: where the motions begin."""
-    round_clear: Bools
-    """Shape (m,): whether holder and needle are known to touch neither patient nor boxes there."""
 
 
 class FirstClear:
@@ -144,10 +158,10 @@ class FirstClear:
         deepest: Of each what blocked the motion that came farthest, of equals the best margin's; None if nothing did.
     """
 
-    def __init__(self, surveyed: Sequence[Surveyed]) -> None:
+    def __init__(self, checker: CellChecker, surveyed: Sequence[Surveyed]) -> None:
         self.answers: list[ReachAnswer | None] = [None] * len(surveyed)
         self.deepest: list[Blocked | None] = [None] * len(surveyed)
-        self._surveyed = surveyed
+        self._checker, self._surveyed = checker, surveyed
         self._starts = np.array([found.starts for found in surveyed])
         self._turns = np.array([found.turns for found in surveyed])
         margins = np.array([found.margins for found in surveyed])
@@ -157,42 +171,45 @@ class FirstClear:
         self._branches, self._rolls = np.divmod(order, margins.shape[2])
         self._round_clear = np.zeros(len(surveyed), np.bool_)
 
-    def next_motions(self) -> NextMotions:
-        """The motions to try next; of no requests where all searches are over."""
+    @property
+    def goes_on(self) -> bool:
+        """Whether any request has a motion left to try."""
+        return bool(self._left.any())
+
+    def try_next(self) -> None:
+        """Try the next motion of each request that has one left: at its standoff, and if clear there along the path."""
         rows = np.flatnonzero(self._left.any(axis=1))
         at = self._left[rows].argmax(axis=1)
-        branches, rolls = self._branches[rows, at], self._rolls[rows, at]
+        branches, rolls, clear = self._branches[rows, at], self._rolls[rows, at], self._round_clear[rows]
         standoffs = self._starts[rows, branches] + self._turns[rows, branches, rolls]
-        return NextMotions(rows, branches, rolls, standoffs, self._round_clear[rows])
-
-    def take(self, checker: StateChecker, motions: NextMotions, contacts: Sequence[Contact | None]) -> None:
-        """Go on from what the motions touch at their standoffs, and check those along the path that touch nothing."""
-        tries: list[ReachAnswer | Blocked] = []
-        for *at, standoff, contact in zip(*motions[:4], contacts, strict=True):
-            if contact is not None:
-                detail = f"{contact.body} touches {contact.other} at standoff"
-                any_roll = ROLL_BODIES.isdisjoint(contact)
-                tries.append(Blocked(0.0, detail, any_roll, at_standoff=True, contact=contact))
-                continue
-            row, branch, roll = map(int, at)
-            found = self._surveyed[row]
-            insertion = Insertion(found.line, branch, float(found.rolls[roll]), found.turns[branch, roll], standoff)
-            tries.append(tried(checker, found, insertion))
-        for row, result in zip(motions.rows.tolist(), tries, strict=True):
+        contacts = self._checker.contacts(standoffs, needle_may_touch_patient=False, round_clear=clear)
+        self._left[rows, at] = False
+        for row, branch, roll, standoff, contact in zip(
+            rows.tolist(), branches.tolist(), rolls.tolist(), standoffs, contacts, strict=True
+        ):
+            result = self._tried(row, branch, roll, standoff, contact)
             if isinstance(result, ReachAnswer):
                 self.answers[row] = result
-            elif (most := self.deepest[row]) is None or result.depth_mm > most.depth_mm:
+                self._left[row] = False
+                continue
+            if (most := self.deepest[row]) is None or result.depth_mm > most.depth_mm:
                 self.deepest[row] = result
-        over = np.array([isinstance(one, ReachAnswer) for one in tries], np.bool_)
-        hopeless = np.array([isinstance(one, Blocked) and one.at_any_roll for one in tries], np.bool_)
-        self._left[motions.rows, self._left[motions.rows].argmax(axis=1)] = False
-        self._left[motions.rows[over]] = False
-        rows = motions.rows[hopeless]
-        self._left[rows] &= self._branches[rows] != motions.branches[hopeless, None]
+            if result.at_any_roll:
+                self._left[row] &= self._branches[row] != branch
         past = [contact is None or contact.other in BODY_NAMES for contact in contacts]  # the workcell is checked first
-        self._round_clear[motions.rows] |= np.array(past, np.bool_)
+        self._round_clear[rows] |= np.array(past, np.bool_)
 
-    def drop_folded(self, checker: StateChecker) -> None:
+    def _tried(
+        self, row: int, branch: int, roll: int, standoff: Floats, contact: Contact | None
+    ) -> ReachAnswer | Blocked:
+        if contact is not None:
+            detail = f"{contact.body} touches {contact.other} at standoff"
+            return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
+        found = self._surveyed[row]
+        insertion = Insertion(found.line, branch, float(found.rolls[roll]), found.turns[branch, roll], standoff)
+        return tried(self._checker, found, insertion)
+
+    def drop_folded(self) -> None:
         """Drop the branches on which the arm touches itself at the standoff whatever the roll.
 
         To be called where a motion of each request was tried: those that go no farther than the standoff change neither
@@ -202,7 +219,7 @@ class FirstClear:
         left = np.zeros(self._starts.shape[:2], np.bool_)
         left[rows, self._branches[rows, at]] = True
         branches, rows = np.nonzero(left.T)  # neighbours in turn: what is proven of one is nearly proven of the next
-        left[rows, branches] = ~checker.folded(self._starts[rows, branches] + self._turns[rows, branches, 0])
+        left[rows, branches] = ~self._checker.folded(self._starts[rows, branches] + self._turns[rows, branches, 0])
         self._left &= np.take_along_axis(left, self._branches, axis=1)
 
 
@@ -220,7 +237,7 @@ class Blocked(NamedTuple):
     contact: Contact | None = None
 
 
-def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> ReachAnswer | Blocked:
+def tried(checker: CellChecker, found: Surveyed, insertion: Insertion) -> ReachAnswer | Blocked:
     """Check one motion for contacts, whose standoff is clear."""
     model = checker.model
     lengths = found.request.needle_length_mm, found.request.standoff_mm
@@ -254,14 +271,10 @@ def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
 
 
 def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
-    """Length by which upper arm and forearm are too short (or too long, folded) for each flange pose.
+    """Length by which upper arm and forearm are too short (or too long, folded) for flange poses (n, 4, 4): (n,), mm.
 
-    Args:
-        T_base_flange: Shape (n, 4, 4), mm.
-
-    Returns:
-        Shape (n,), mm: the least over all branches; 0 where a solution exists; infinite where no branch can turn its
-        wrist so, because the wrist centre stands inside the cylinder of radius d4 about axis 1.
+    The least over all branches; 0 where a solution exists; infinite where no branch can turn its wrist so, because the
+    wrist centre stands inside the cylinder of radius d4 about axis 1.
     """
     poses = np.array(T_base_flange, dtype=np.float64, order="C").reshape(-1, 4, 4)
     missing = np.empty(len(poses))
@@ -287,12 +300,11 @@ def _missing_reach(lengths, T, missing):  # type: ignore[no-untyped-def]  # numb
 
 MARGIN_FRACTION = 0.5
 """A pose with less than this fraction of the best margin is no goal: a shorter path is not worth a cramped arm."""
-
 NEAREST = 4
 """Goals kept of each branch: those nearest to home."""
 
 
-def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats) -> list[ReachAnswer]:
+def approach_goals(checker: CellChecker, request: ReachRequest, q_home: Floats) -> list[ReachAnswer]:
     """The motions that may follow an approach, nearest to home first; empty if the arm does not reach the direction.
 
     Each answer of :func:`every_reach`, and the same with any joint rotated by whole turns, as long as all of the
@@ -309,7 +321,7 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
     return [answer for answer in every if id(answer) in chosen]
 
 
-def _rotated(checker: StateChecker, answer: ReachAnswer) -> list[ReachAnswer]:
+def _rotated(checker: CellChecker, answer: ReachAnswer) -> list[ReachAnswer]:
     """An answer with every combination of whole turns that its limits allow; the bodies stand where they stood."""
     motions = [
         answer.insertion_q + (q - answer.insertion_q[0])

@@ -24,9 +24,7 @@ from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | float) -> Floats:
     """Distance of the waiting tip from the target, mm: what the case states, or the skin's distance and `skin_gaps`.
 
-    Args:
-        path_length: Target to skin, mm; NaN without a skin entry.
-        skin_angle: Shape of ``path_length``, rad.
+    Of path lengths, mm, NaN without a skin entry, and as many skin angles, rad.
     """
     path_length = np.asarray(path_length, dtype=float)
     if needle.standoff_mm is None:
@@ -71,7 +69,6 @@ UNEVEN_SKIN_MM = 1.0
 """Added along the needle because skin is not flat and its triangles are coarser than it. On the embedded abdomen and
 on two label maps of a real CT 0 and 0.1 mm leave the needle too near in up to 10 % of the organ-safe solid angle, 1 mm
 in none of it."""
-
 MAX_GAP_MM = 200.0
 """Largest gap, as large as a case may state: along a path that grazes the skin none would suffice."""
 

@@ -19,62 +19,21 @@ from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, l
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
-from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.state_checker import Contact, SweptBodies, motion_bounds
+from puncture_twin.planning.collision.state_checker import SweptBodies, motion_bounds
 
 
 @dataclass(frozen=True, eq=False)
 class ReachRequest:
     """One direction that the arm shall reach along."""
 
-    target_base: Floats
-    """Shape (3,), mm: the lesion, base frame."""
-    outward_base: Floats
-    """Shape (3,), unit: from the target out of the body, base frame."""
+    target_base: Floats  # shape (3,), mm: the lesion, base frame
+    outward_base: Floats  # shape (3,), unit: from the target out of the body, base frame
     needle_length_mm: float
-    standoff_mm: float
-    """Tip to target before the insertion starts."""
+    standoff_mm: float  # tip to target before the insertion starts
 
     def __post_init__(self) -> None:
         for name in ("target_base", "outward_base"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
-
-
-@dataclass(frozen=True, eq=False)
-class ReachAnswer:
-    """Whether and how the arm reaches along one direction."""
-
-    reachable: bool
-    reason: Reason
-    """``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``."""
-    depth_mm: float | None
-    """How far the needle was inserted from standoff when it was blocked; None for other reasons."""
-    detail: str
-    """One sentence for people: what touched what, or what was missing; empty when reachable."""
-    contact: Contact | None
-    """What touched what, where that was the reason."""
-    roll: float
-    """Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable."""
-    branch: int
-    """Index among the eight branches of ``inverse``; -1 when not reachable."""
-    insertion_q: Floats
-    """Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable."""
-    insertion_depth_mm: Floats
-    """Shape (m,), mm inserted from standoff at each row."""
-    margin: float
-    """0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the three
-    singularity terms. 0 when not reachable."""
-
-    @classmethod
-    def refused(
-        cls, reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None
-    ) -> ReachAnswer:
-        """The answer for a direction that the arm does not reach, or not to the target."""
-        return cls(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)
-
-    def __post_init__(self) -> None:
-        self.insertion_q.setflags(write=False)
-        self.insertion_depth_mm.setflags(write=False)
 
 
 MAX_SWEEP_MM = 2.0
@@ -90,8 +49,7 @@ class Insertion(NamedTuple):
     roll: float
     turn: Floats
     """Shape (6,), rad: what to add to the branch's path at roll 0, the roll and whole turns."""
-    standoff: Floats
-    """Shape (6,), rad: where the motion begins."""
+    standoff: Floats  # shape (6,), rad: where the motion begins
 
 
 class Surveyed(NamedTuple):
@@ -99,10 +57,8 @@ class Surveyed(NamedTuple):
 
     request: ReachRequest
     line: NeedleLine
-    depths: Floats
-    """Shape (m,), mm: the path's samples from the standoff on, rising."""
-    distances: Floats
-    """Shape (m,), mm: target to flange there."""
+    depths: Floats  # shape (m,), mm: the path's samples from the standoff on, rising
+    distances: Floats  # shape (m,), mm: target to flange there
     rolls: Floats
     stop_at: NDArray[np.int64]
     """Shape (8,): index of the sample at which the path ends, -1 where it reaches the target."""
@@ -110,8 +66,7 @@ class Surveyed(NamedTuple):
     """Shape (8, 6), rad: each path's first configuration at roll 0; NaN where there is none."""
     margins: Floats
     """Shape (8, r): see :func:`reach_margin`; NaN where the path ends early or leaves the joint limits."""
-    turns: Floats
-    """Shape (8, r, 6), rad: what to add to the path at roll 0, the roll and whole turns."""
+    turns: Floats  # shape (8, r, 6), rad: what to add to the path at roll 0, the roll and whole turns
 
     def insertions(self) -> Iterator[Insertion]:
         """The motions that kinematics allows, the best margin first; of equals the first branch, then roll."""
@@ -129,10 +84,9 @@ MARGIN_DIGITS = 9
 def surveyed(
     model: UrModel, requests: Sequence[ReachRequest], lines: Sequence[NeedleLine], rolls: Floats
 ) -> list[Surveyed]:
-    """Kinematics of each request: every branch and roll, by whole turns as far from the joint limits as possible.
+    """Kinematics of each request: every branch and roll (r,), rad.
 
-    Args:
-        rolls: Shape (r,), rad.
+    By whole turns each motion is as far from the joint limits as possible.
     """
     bounds = (MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM, FULL_MARGIN_RAD)
     stops, starts = np.empty((len(lines), N_BRANCHES), np.int64), np.empty((len(lines), N_BRANCHES, 6))

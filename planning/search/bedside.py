@@ -22,10 +22,8 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 class EntryFacts:
     """One path from outside to the target, as described to a person at the patient."""
 
-    space: Space
-    """Of the case: what a person typed is answered in it."""
-    entry_mm: Floats
-    """Shape (3,), the skin entry in that space, mm; NaN without one."""
+    space: Space  # of the case: what a person typed is answered in it
+    entry_mm: Floats  # shape (3,), the skin entry in that space, mm; NaN without one
     place: EntryPlace | None
     """Seen from the nearest marker, or from the target where the case has none; None without an entry."""
     planes: NeedlePlanes | None
@@ -73,8 +71,7 @@ class EntryFacts:
 class ScannedEntry(NamedTuple):
     """Where a skin entry is in the scan."""
 
-    slice: int
-    """Its slice, 1 at the feet; 0 or beyond ``slices`` outside of the image."""
+    slice: int  # its slice, 1 at the feet; 0 or beyond ``slices`` outside of the image
     slices: int
     table_mm: float
     """The slice's z, as DICOM has it: a console's slice location or, with its own sign, table position."""
@@ -112,16 +109,11 @@ def slice_numbers(grid: VolumeGrid) -> tuple[Floats, int]:
 def entry_facts(
     case: Case, markers: Sequence[Landmark], entry_ct: Floats, outward_ct: Floats, grid: VolumeGrid | None = None
 ) -> EntryFacts:
-    """Skin entry, nearest landmark and scanner angles of one path.
-
-    Args:
-        entry_ct: Shape (3,), mm; NaN without a skin entry.
-        outward_ct: Shape (3,), unit, from the target outward.
-    """
+    """Skin entry (3,), mm (NaN without one), nearest landmark and scanner angles of one path outward (3,), unit."""
     landmarks = markers or (Landmark("the target", np.asarray(case.target_ct)),)
     planes = None if case.space is Space.LOCAL else needle_planes(outward_ct)
-    entry_mm = to_lps(entry_ct[None], case.space)[0]  # the change of signs undoes itself
     place, scanned = entry_place(entry_ct, landmarks), None
+    entry_mm = to_lps(entry_ct[None], case.space)[0]  # the change of signs undoes itself
     if grid is not None and place is not None and planes is not None:
         number, count = slice_numbers(grid)
         x, y, z = entry_ct.tolist()
@@ -196,7 +188,7 @@ LOCAL = tuple((axis, f"along +{name}", f"along -{name}") for axis, name in enume
 
 
 class Landmark(NamedTuple):
-    """A point that can be found again at the patient; ``point_ct`` has shape (3,), mm."""
+    """A point that a person recognises at the patient; ``point_ct`` has shape (3,), mm."""
 
     name: str
     point_ct: Floats

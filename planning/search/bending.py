@@ -39,17 +39,12 @@ from puncture_twin.planning.search.candidates import Candidates, Verdict
 def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBound) -> Candidates:
     """Reject candidates whose clearance is less than the margin and the largest deflection."""
     deflection = bound.at(candidates.path.length)
-    verdict = bent_verdict(candidates.verdict, anatomy.checked, candidates.clearance.distance, deflection)
+    verdict = bent_verdict(candidates.verdict, anatomy.checked, candidates.clearance.by_structure, deflection)
     return replace(candidates, verdict=verdict, deflection=deflection)
 
 
 def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance: Floats, deflection: Floats) -> Verdict:
-    """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs.
-
-    Args:
-        clearance: Shape (n, k), of the straight needle, mm.
-        deflection: Shape (n,), the greatest, mm.
-    """
+    """A verdict with candidates rejected whose clearance (n, k) is less than margin + deflection (n,), mm."""
     demanding = np.flatnonzero([one.demands_margin for one in structures])
     if not len(demanding):
         return verdict
@@ -96,12 +91,9 @@ class Insertion(NamedTuple):
 def insertion_along(
     bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
 ) -> Insertion:
-    """Deflection, forces and buckling of the insertion along one direction.
+    """Deflection, forces and buckling of the insertion along one direction (3,), unit, to a target (3,), mm.
 
-    Args:
-        end_ct: Shape (3,), mm, where the path ends: the target.
-        outward_ct: Shape (3,), unit.
-        path_length: From there to the skin, mm.
+    The path's length is from there to the skin, mm.
     """
     layers = path_layers(bending, anatomy, end_ct, outward_ct, path_length)
     stiffest = max(layer.tissue.stiffness_n_mm2 for layer in layers)
@@ -181,12 +173,9 @@ class Stretch(NamedTuple):
 
 
 def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float) -> tuple[Stretch, ...]:
-    """Follow a path from the target to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT.
+    """Follow a path from the target (3,), LPS mm, to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT.
 
-    Args:
-        target_ct: Shape (3,), LPS mm.
-        outward_ct: Shape (3,), unit.
-        path_length: Target to skin, mm; NaN without an entry: nothing is followed.
+    ``outward_ct`` (3,) is a unit vector; of NaN length, without an entry, nothing is followed.
     """
     if anatomy.scan is None or not np.isfinite(path_length):
         return ()
@@ -205,12 +194,9 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
 
 
 def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
-    """Which depths of a path are inside a closed structure, by the parity of the crossings before.
+    """Which depths (n,), mm, of a path from a target (3,) along a unit vector (3,) are inside a closed structure.
 
-    Args:
-        target_ct: Shape (3,), mm.
-        outward_ct: Shape (3,), unit.
-        depths: Shape (n,), from the target outward, mm.
+    By the parity of the crossings before.
     """
     points = target_ct + depths[:, None] * outward_ct
     low, high = structure.mesh.bounds

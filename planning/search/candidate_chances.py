@@ -80,7 +80,6 @@ BEST = 200
 REFINED_FROM = 1 / 60
 """Fraction of its limit from which on a chance of first order, or its bound, is refined. The chance to be displaced so
 far to any side is 56 times that to one side at 3.5 standard deviations, and less for less."""
-
 ROWS_AT_ONCE = 4096
 """Candidates at once: a table of gradients of 60 structures stays below 20 MB."""
 
@@ -95,7 +94,7 @@ def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidate
     surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])  # in the worst direction
     greatest, rows = chances.touch.copy(), np.flatnonzero(candidates.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
-        outward, slack = candidates.outward_ct[part], candidates.clearance.distance[part][:, columns]
+        outward, slack = candidates.outward_ct[part], candidates.clearance.by_structure[part][:, columns]
         length = float(case_axis_lengths(model.case, model.anatomy, outward)[:, columns].max())
         cov_ct = error.covariance_ct(candidates.arm.q_insertion[part])
         bound = touch_bound(slack, outward, cov_ct, length, surface_mm, error.freedom)
@@ -114,10 +113,11 @@ def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Cand
     return replace(candidates, chances=chances.put(rows, better))
 
 
-def with_best_refined(candidates: Candidates, model: ChanceModel) -> Candidates:
+def with_best_chances(candidates: Candidates, model: ChanceModel) -> Candidates:
     """Refine the candidates that people are shown: the best of all, and the best of every window.
 
-    Those that break a limit then are rejected, and the rest ranked again, until no new one is among them.
+    Those that break a limit then are rejected, and the rest ranked again, until no new one is among them. The best get
+    the chance to touch anything too, all structures linearised together.
     """
     while True:
         best, chances = [window.best for window in candidates.windows], candidates.chances
@@ -125,8 +125,15 @@ def with_best_refined(candidates: Candidates, model: ChanceModel) -> Candidates:
         shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)
         rows = shown[~chances.refined[shown] & np.isfinite(chances.hit[shown])]  # still of first order
         if not len(rows):
-            return candidates
+            break
         candidates = ranked(model.case, limited(model.case, with_refined(candidates, model, rows)))
+    rows = candidates.ranked[:BEST]
+    if not len(rows):
+        return candidates
+    needles = model.needles(candidates.outward_ct[rows], candidates.arm.q_insertion[rows])
+    joint, radius = chances.touch_joint.copy(), model.case.needle.radius_mm
+    joint[rows] = joint_touch_chance(needles.near, needles.cov_ct, radius, needles.freedom, needles.surface_mm)
+    return replace(candidates, chances=replace(chances, touch_joint=joint))
 
 
 NORMALS = 4096
@@ -161,16 +168,3 @@ def joint_touch_chance(
         change = sizes[:, None] * (draws @ (near.gradient[row] @ root).T + off * surfaces[row])
         chances[row] = np.mean(np.any(change < threshold_mm - near.distance[row], axis=1))
     return chances
-
-
-def with_joint_chances(candidates: Candidates, model: ChanceModel) -> Candidates:
-    """Add, for the best of the ranked candidates, the chance to touch anything, all structures linearised together."""
-    rows = candidates.ranked[:BEST]
-    if candidates.chances is None or not len(rows):
-        return candidates
-    needles = model.needles(candidates.outward_ct[rows], candidates.arm.q_insertion[rows])
-    joint = candidates.chances.touch_joint.copy()
-    joint[rows] = joint_touch_chance(
-        needles.near, needles.cov_ct, model.case.needle.radius_mm, needles.freedom, needles.surface_mm
-    )
-    return replace(candidates, chances=replace(candidates.chances, touch_joint=joint))

@@ -93,13 +93,13 @@ class Path(Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class Clearance(Columns):
+class ClearanceColumns(Columns):
     """How far the needle's surface stays from each of k structures, mm."""
 
     structures: tuple[str, ...]
     margins: Floats
     """Shape (k,), what each structure demands; NaN for one that demands nothing."""
-    distance: Floats
+    by_structure: Floats
     """Shape (n, k), axis distance minus needle radius."""
     least: Floats
     """Shape (n,), smallest over the structures with a margin."""
@@ -164,7 +164,7 @@ class Candidates(Columns, Shown):
     """Shape (n, 3), unit vectors from the target outward."""
     verdict: Verdict
     path: Path
-    clearance: Clearance
+    clearance: ClearanceColumns
     arm: ArmColumns
     ranking: Ranking
     safe_cone: Floats

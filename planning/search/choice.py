@@ -48,18 +48,14 @@ LEAST_LEVER_MM = 1.0
 class Choice:
     """A person's choice of a candidate; with nothing stated, the best one that the arm can approach."""
 
-    angles: tuple[float, float] | None = None
-    """θ and β, rad."""
-    rank: int | None = None
-    """1 is the best candidate."""
-    window: int | None = None
-    """1 is the window of the best candidate: then the best of this window."""
+    angles: tuple[float, float] | None = None  # θ and β, rad
+    rank: int | None = None  # 1 is the best candidate
+    window: int | None = None  # 1 is the window of the best candidate: then the best of this window
     entry_mm: tuple[float, float, float] | None = None
     """Where the needle is to enter the skin, in the case's space, as it is typed."""
     entry_file: Path | None = None
     """A markups file that holds the entry instead; `with_file_read` reads it."""
-    read: tuple[Input, ...] = ()
-    """That file, once it has been read."""
+    read: tuple[Input, ...] = ()  # that file, once it has been read
 
     @property
     def of_grid(self) -> bool:
@@ -188,11 +184,11 @@ def with_file_read(case: Case, choice: Choice) -> Choice:
     points = parse_points(data, path, default_space=case.space).points
     if len(points) > MOST_POINTS:
         refuse(f"{len(points)} points", path, "one point, or a line from entry to target", "wrong_count")
-    away = np.linalg.norm(points - case.target_ct, axis=1)
-    if len(points) == MOST_POINTS and away.min() > NEAR_ENTRY_MM:
+    distances = np.linalg.norm(points - case.target_ct, axis=1)
+    if len(points) == MOST_POINTS and distances.min() > NEAR_ENTRY_MM:
         allowed = f"a line with one end within {NEAR_ENTRY_MM:g} mm of the target"
-        refuse(f"neither end is at the target: {away.min():.1f} mm away", path, allowed, "line_misses_target")
-    x, y, z = to_lps(points[[int(np.argmax(away))]], case.space)[0].tolist()  # the change of signs undoes itself
+        refuse(f"neither end is at the target: {distances.min():.1f} mm away", path, allowed, "line_misses_target")
+    x, y, z = to_lps(points[[int(np.argmax(distances))]], case.space)[0].tolist()  # the change of signs undoes itself
     return replace(choice, entry_mm=(x, y, z), read=(content_input("entry", str(path), data),))
 
 
@@ -319,9 +315,9 @@ def stated_choice(
         return stated
     if stated != Choice():
         refuse("a candidate beside another choice", where, "one of them", "conflicting_options")
-    found, row = candidate
-    if not is_kind("Candidates", found):
-        what = f"a candidate of a value {shown_value(found)}"
+    candidates, row = candidate
+    if not is_kind("Candidates", candidates):
+        what = f"a candidate of a value {shown_value(candidates)}"
         refuse(what, where, "candidates.best or candidates.pick(row)", "wrong_type")
-    found, row = context.own(found).pick(row)  # the angles of another case's are another path here
-    return Choice(angles=(float(found.theta[row]), float(found.beta[row])))
+    candidates, row = context.own(candidates).pick(row)  # the angles of another case's are another path here
+    return Choice(angles=(float(candidates.theta[row]), float(candidates.beta[row])))

@@ -20,11 +20,11 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.clearance.engine import Clearances
+from puncture_twin.planning.clearance.engine import MeasuredClearances
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.reach.reach import assess_reach_all
+from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
 from puncture_twin.planning.reach.standoff import standoffs
-from puncture_twin.planning.reach.survey import ReachAnswer, ReachRequest
+from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.search.candidates import ARM_CHECKED, ArmColumns, Candidates, Verdict
 
 Column = NDArray[Any] | str | float
@@ -35,7 +35,7 @@ SKIN = "skin"
 
 def first_broken(
     paths: SkinPaths,
-    clearances: Clearances,
+    clearances: MeasuredClearances,
     structures: tuple[Structure, ...],
     *,
     needle: Needle,
@@ -80,11 +80,11 @@ def first_broken(
 def skin_allows(paths: SkinPaths, needle: Needle, max_skin_angle: float) -> Bools:
     """Which paths break no constraint of the skin, shape (n,), whatever structures do; ``max_skin_angle`` in rad."""
     none = np.empty((len(paths.path_length), 0))
-    nothing = Clearances(none, none, none.astype(bool))
+    nothing = MeasuredClearances(none, none, none.astype(bool))
     return first_broken(paths, nothing, (), needle=needle, max_skin_angle=max_skin_angle).safe
 
 
-def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
+def worst_violation(clearances: MeasuredClearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
     """Column of the structure whose margin is violated by most, shape (n,); 0 where none is.
 
     Of equal violations that at the least depth counts.
@@ -114,7 +114,7 @@ def closest_miss(candidates: Candidates) -> int | None:
         if len(rows) and reason is Reason.TOO_CLOSE:
             clearance = candidates.clearance
             demanded = ~np.isnan(clearance.margins)
-            rows = rows[np.argmin((clearance.margins - clearance.distance[rows])[:, demanded].max(axis=1)) :]
+            rows = rows[np.argmin((clearance.margins - clearance.by_structure[rows])[:, demanded].max(axis=1)) :]
         if len(rows):
             return int(rows[0])
     return None
@@ -137,6 +137,8 @@ class ArmReach:
 def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:
     """Check whether the arm reaches, and can insert along, every candidate that is safe so far; fill its columns."""
     rows = np.flatnonzero(candidates.safe)
+    if not len(rows):  # nothing is left to ask the arm about
+        return replace(candidates, arm_note=ARM_CHECKED)
     requests = reach_requests(case, candidates, rows, reach.T_base_ct)
     return with_answers(case, candidates, assess_reach_all(reach.checker, requests, progress))
 

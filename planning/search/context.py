@@ -53,9 +53,6 @@ EngineChoice = str | Callable[..., ClearanceEngine]
 """A name of `ENGINES`, or a custom class, made of (meshes, progress), that implements `ClearanceEngine`.
 
 Its distances are verified against the fast engine's (`VerifiedEngine`): they may be smaller, and never larger."""
-
-COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
-"""The unit of each engine's progress."""
 TARGET_CACHE_BYTES = 2_000_000_000
 """Upper limit of the cache that a context shares with those that `at` makes of it for other targets."""
 NO_BASE = "the case does not state where the robot's base is"
@@ -86,7 +83,7 @@ class CaseContext(Shown):
 
     def _facts(self) -> Facts:
         yield "structures", first_few([one.name for one in self.anatomy.structures])
-        yield "arm", self.arm
+        yield "arm", self.arm_note
         yield "sides", sides_text(self.sides) or "of no body"
         for warning in self.anatomy.warnings:
             yield "warning", warning
@@ -117,21 +114,17 @@ class CaseContext(Shown):
 
     @brief
     def __repr__(self) -> str:
-        return f"case {self.case.name}, {plural(len(self.anatomy.structures), 'structure')}; arm {self.arm}"
+        return f"case {self.case.name}, {plural(len(self.anatomy.structures), 'structure')}; arm {self.arm_note}"
 
     @property
-    def arm(self) -> str:
+    def arm_note(self) -> str:
         """Whether the arm is checked, and if not, why: see `Candidates.arm_note`."""
         if self.reach is not None:
             return ARM_CHECKED
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
 
     def require_arm(self) -> ArmReach:
-        """The checker of the arm, for what cannot do without it.
-
-        Raises:
-            InputError: Says what the case lacks, or that the arm was switched off.
-        """
+        """The checker of the arm. Raises InputError: Says what the case lacks, or that the arm was switched off."""
         if self.placement is None:
             refuse(NO_BASE, self.case.path, ALLOWED_BASE, "no_base")
         if self.reach is None:
@@ -176,13 +169,13 @@ class CaseContext(Shown):
                 progress=partial(self.watcher.count, "directions of the arm"),
             )
             others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates, self.memory))
-        return replace(candidates, arm_note=self.arm, findings=others, provenance=self.provenance())
+        return replace(candidates, arm_note=self.arm_note, findings=others, provenance=self.provenance())
 
     def check(self, theta: Floats | float, beta: Floats | float) -> Candidates:
         """Check a single direction, or several, shape (n,), rad, without the grid's windows and safe cones."""
         directions = self.case.direction(theta, beta)
         candidates = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
-        return replace(candidates, arm_note=self.arm, provenance=self.provenance())
+        return replace(candidates, arm_note=self.arm_note, provenance=self.provenance())
 
     def explain(self, theta: float, beta: float) -> Explanation:
         """Check a single direction (rad), with everything it was checked against and its uncertainty."""
@@ -207,11 +200,7 @@ class CaseContext(Shown):
     def regions_ct(self, q: Floats) -> Floats | None:
         """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (n, 3, 3), mm^2, CT axes.
 
-        Args:
-            q: Shape (n, 6), rad, the tip on the target; NaN where the arm does not reach it, and then in the region.
-
-        Returns:
-            None without declared errors.
+        Of joints ``q`` (n, 6), rad, the tip on the target; NaN where these are. None without declared errors.
         """
         if self.chance is None:
             return None
@@ -224,8 +213,7 @@ class CaseContext(Shown):
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.
 
-        Raises:
-            CrossCheckError: A distance differs by more than rounding.
+        Raises CrossCheckError: A distance differs by more than rounding.
         """
         with self.stages.time("cross-check"):
             case, outward = self.case, self.case.directions().outward_ct
@@ -242,7 +230,7 @@ class CaseContext(Shown):
             "version": version("puncture-twin"),
             "seed": self.case.rehearsal.seed,
             "step_deg": float(np.degrees(self.case.search.step)),
-            "arm": self.arm,
+            "arm": self.arm_note,
             "warnings": list(self.anatomy.warnings),
             "findings": [one.document() for one in self.anatomy.findings],
         }
@@ -314,19 +302,18 @@ def _build_context(
     memory = Memory(TARGET_CACHE_BYTES) if cache.memory is NO_MEMORY else cache.memory
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
-        count = partial(watcher.count, COUNTED[engine] if isinstance(engine, str) else COUNTED["fast"])
-        clearance_engine: ClearanceEngine
-        clearance_engine = FclEngine(meshes, count) if engine == "fcl" else FastEngine(meshes, count, cache.memory)
+        tick = partial(watcher.count, "directions" if engine == "fcl" else "structures")  # the unit of its progress
+        exact: ClearanceEngine = FclEngine(meshes, tick) if engine == "fcl" else FastEngine(meshes, tick, cache.memory)
         if not isinstance(engine, str) and engine is not FastEngine:
-            clearance_engine = VerifiedEngine(engine(meshes, count), clearance_engine)
+            exact = VerifiedEngine(engine(meshes, tick), exact)
         reach = None
         if arm and placement is not None:
             T_base_ct = placement.T_base_ct
             reach = ArmReach(own_checker(case, anatomy, T_base_ct, memory), T_base_ct)
             _ = reach.checker  # what cannot be is refused now
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
-        chance = chance_model(case, anatomy, clearance_engine, error)
-    return CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages, memory)
+        chance = chance_model(case, anatomy, exact, error)
+    return CaseContext(case, anatomy, placement, exact, reach, chance, watcher, stages, memory)
 
 
 def alternatives(
@@ -357,7 +344,7 @@ def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates, me
     """How many directions are unsafe only for the body that is assumed beyond the image: safe if it ends there."""
     clearance, named = candidates.clearance, candidates.verdict.structure == BEYOND_IMAGE
     others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)
-    rows = np.flatnonzero(named & (clearance.distance[:, others] >= clearance.margins[others]).all(axis=1))
+    rows = np.flatnonzero(named & (clearance.by_structure[:, others] >= clearance.margins[others]).all(axis=1))
     if not len(rows) or case.ct.beyond_mm == 0.0:
         return 0
     narrow = replace(case, ct=replace(case.ct, beyond_mm=0.0))

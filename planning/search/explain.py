@@ -93,7 +93,7 @@ class Explanation(Shown):
     def clearances(self) -> dict[str, float]:
         """Structure to clearance, mm."""
         clearance = self.candidates.clearance
-        return dict(zip(clearance.structures, map(float, clearance.distance[0]), strict=True))
+        return dict(zip(clearance.structures, map(float, clearance.by_structure[0]), strict=True))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""
@@ -137,7 +137,7 @@ class Explanation(Shown):
 
     def _declared(self) -> dict[str, Any]:
         """What a case has only where it declares errors, bending, breathing, guidance or lines of sight."""
-        row, found, insertion = self.candidates, self.candidates.breathing, self.insertion
+        row, breathing, insertion = self.candidates, self.candidates.breathing, self.insertion
         optional: dict[str, Any] = {}
         if self.case.errors is not None:
             optional["chances"] = None if self.breakdown is None else self.breakdown.summary()
@@ -149,11 +149,11 @@ class Explanation(Shown):
                 "buckling_free_n": None if insertion is None else insertion.buckling_free_n,
                 "buckling_pinned_n": None if insertion is None else insertion.buckling_pinned_n,
             }
-        if found is not None:
+        if breathing is not None:
             optional["breathing"] = {
-                "safe_all_phases": bool(found.safe_all_phases[0]),
-                "worst_phase": finite(found.worst_phase[0]),
-                "breathing_clearance_mm": finite(found.clearance[0]),
+                "safe_all_phases": bool(breathing.safe_all_phases[0]),
+                "worst_phase": finite(breathing.worst_phase[0]),
+                "breathing_clearance_mm": finite(breathing.clearance[0]),
                 "safe_means": row.safe_text,
             }
         if self.guidance:
@@ -227,12 +227,12 @@ class Explanation(Shown):
         return insertion_along(bending, self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path.length[0]))
 
     def _breath(self) -> list[str]:
-        found, breathing = self.candidates.breathing, self.case.breathing
-        if found is None or breathing is None or np.isnan(found.clearance[0]):
+        columns, breathing = self.candidates.breathing, self.case.breathing
+        if columns is None or breathing is None or np.isnan(columns.clearance[0]):
             return []
         return [
-            f"  breathing      {found.clearance[0]:8.2f} mm least clearance, at "
-            f"{breathing.phase_text(float(found.worst_phase[0]))}",
+            f"  breathing      {columns.clearance[0]:8.2f} mm least clearance, at "
+            f"{breathing.phase_text(float(columns.worst_phase[0]))}",
             "                 an inserted needle moves with the organ and bends: the verdict does not cover that",
         ]
 
@@ -249,7 +249,7 @@ class Explanation(Shown):
 
     def structure_lines(self, most: int | None = NEAREST) -> list[str]:
         """Clearance and margin of each structure, the nearest first; beyond ``most`` only of those too near."""
-        structures, clearances = self.anatomy.checked, self.candidates.clearance.distance[0]
+        structures, clearances = self.anatomy.checked, self.candidates.clearance.by_structure[0]
         order = np.argsort(clearances, kind="stable")
         short = np.array([s.demands_margin and c < s.margin_mm for s, c in zip(structures, clearances, strict=True)])
         shown = [at for rank, at in enumerate(order) if most is None or rank < most or short[at]]
@@ -267,7 +267,7 @@ class Explanation(Shown):
     def nearest_demanding(self) -> str:
         """The structure with the least clearance among those that demand a margin; "" without any."""
         clearance = self.candidates.clearance
-        demanded = np.where(np.isnan(clearance.margins), np.inf, clearance.distance[0])
+        demanded = np.where(np.isnan(clearance.margins), np.inf, clearance.by_structure[0])
         return clearance.structures[int(np.argmin(demanded))] if np.isfinite(demanded).any() else ""
 
     def _arm(self) -> list[str]:
@@ -291,7 +291,7 @@ def decimals(structure: Structure) -> int:
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
     """Warnings where a longer needle would free more directions than this one does."""
     short = candidates.verdict.reason == Reason.TOO_LONG.value
-    crossed = (candidates.clearance.distance < candidates.clearance.margins).any(axis=1)
+    crossed = (candidates.clearance.by_structure < candidates.clearance.margins).any(axis=1)
     freed = short & ~crossed & (candidates.path.skin_angle <= case.search.max_skin_angle)
     if freed.sum() <= candidates.safe.sum():
         return []

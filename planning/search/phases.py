@@ -23,7 +23,7 @@ from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.clearance.engine import ClearanceEngine, Clearances, measure_clearances
+from puncture_twin.planning.clearance.engine import ClearanceEngine, MeasuredClearances, measure_clearances
 from puncture_twin.planning.collision.workcell import GANTRY, OF_CASE_FILE, case_checker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -50,15 +50,18 @@ def with_breathing(
     for at, phase in enumerate(phases):
         through = rejected_at(through, rows, phase.verdict, breathing, phase.s)
         if at:
-            through = checked_between(body, through, phases[at - 1], phase)
+            before, columns = phases[at - 1], np.arange(len(body.demanding))
+            deflection = np.fmax(before.deflection, phase.deflection)
+            gap = _Gap(rows, columns, before.s, phase.s, before.excess, phase.excess, deflection)
+            through = checked_between(body, through, gap)
         verdict = through if at < within else verdict  # the gate's window is the first of them
     worst, clearance = np.full((2, len(candidates)), np.nan)
     excess = np.array([phase.least_excess for phase in phases[:within]])
     worst[rows] = breathing.positions[excess.argmin(axis=0)]
     clearance[rows] = np.min([phase.clearance.min(axis=1, initial=np.inf) for phase in phases[:within]], axis=0)
     safe_all = through.safe & breathing.whole
-    columns = BreathingColumns(safe_all, worst, clearance, breathing.window_text)
-    return replace(candidates, verdict=verdict, breathing=columns)
+    breath = BreathingColumns(safe_all, worst, clearance, breathing.window_text)
+    return replace(candidates, verdict=verdict, breathing=breath)
 
 
 def with_breathing_reach(
@@ -144,11 +147,6 @@ class BreathingBody:
         """Margins of the structures with one, shape (k,), mm."""
         return np.array([self.anatomy.checked[column].margin_mm for column in self.demanding], dtype=np.float64)
 
-    def moves_mm(self, low: float, high: float) -> Floats:
-        """How far each structure with a margin moves against the target between two positions, shape (k,)."""
-        weights = self.weights.structures[self.demanding]
-        return np.asarray(abs(high - low) * self.breathing.amplitude_mm * np.abs(1 - weights))
-
     def at(self, rows: Ints, s: float) -> Phase:
         """The phase of candidates ``rows`` (m,) at a position, as if inserted there."""
         case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct[rows]
@@ -161,15 +159,10 @@ class BreathingBody:
         if self.bound is not None:
             verdict = bent_verdict(verdict, checked, clearances.clearance, deflection)
         clearance = clearances.clearance[:, self.demanding]
-        return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
+        return Phase(s, verdict, clearance, clearance - self.margins, deflection)
 
     def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
-        """Clearance beyond the margins of some structures at a position, shape (m, c), mm.
-
-        Args:
-            rows: Shape (m,), which candidates.
-            columns: Shape (c,), which of the structures with a margin.
-        """
+        """Clearance of candidates ``rows`` (m,) beyond the margins of some demanding structures (c,): (m, c), mm."""
         case, which = self.case, self.demanding[columns]
         distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
         for weight in np.unique(weights):
@@ -179,10 +172,10 @@ class BreathingBody:
             distance[:, group] = part.measure(origin, self.candidates.outward_ct[rows], length, shown=False).distance
         return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
 
-    def _clearances(self, rows: Ints, shifts_ct: Floats) -> Clearances:
+    def _clearances(self, rows: Ints, shifts_ct: Floats) -> MeasuredClearances:
         """Clearances to all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
         checked, candidates, radius = self.anatomy.checked, self.candidates, self.case.needle.radius_mm
-        clearance = candidates.clearance.distance[rows].copy()
+        clearance = candidates.clearance.by_structure[rows].copy()
         depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
         moved = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
         for shift in np.unique(shifts_ct[moved], axis=0):
@@ -191,7 +184,7 @@ class BreathingBody:
             target, outward, part = self.case.target_ct + shift, candidates.outward_ct[rows], self.engine.of(columns)
             at = measure_clearances(part, structures, target, outward, length=length, radius=radius)
             clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
-        return Clearances(clearance, depth, violated)
+        return MeasuredClearances(clearance, depth, violated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,15 +192,10 @@ class Phase:
     """Verdict and clearances of some candidates at one position of the breath."""
 
     s: float
-    rows: Ints
-    """Shape (m,), which candidates."""
     verdict: Verdict
-    clearance: Floats
-    """Shape (m, k), to the k structures with a margin, mm."""
-    excess: Floats
-    """Shape (m, k), the same less the margins."""
-    deflection: Floats
-    """Shape (m,), how far the needle may bend, mm; 0 where it does not."""
+    clearance: Floats  # shape (m, k), to the k structures with a margin, mm
+    excess: Floats  # shape (m, k), the same less the margins
+    deflection: Floats  # shape (m,), how far the needle may bend, mm; 0 where it does not
 
     @property
     def least_excess(self) -> Floats:
@@ -221,11 +209,7 @@ CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
-    """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason.
-
-    Args:
-        rows: Shape (m,), those that were checked at the phase.
-    """
+    """A verdict with candidates rejected, of ``rows`` (m,), that are unsafe at one phase; others keep their reason."""
     new = ~at_phase.safe & verdict.of(rows).safe
     at_phase = at_phase.of(np.flatnonzero(new))
     reasons = zip(at_phase.reason, at_phase.detail, strict=True)
@@ -239,17 +223,6 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
         amount=np.where(np.isin(at_phase.reason, CLEARANCES), at_phase.amount, np.nan),
         detail=np.array(details, dtype=object),
     )
-
-
-def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
-    """The verdict with candidates rejected that are not proven clear between two positions.
-
-    A structure moves by m between them, so a clearance changes by m at most: its least in between is at least
-    (low + high - m) / 2. Where that does not suffice, the interval is halved and measured in the middle (`_checked`).
-    """
-    deflection = np.fmax(low.deflection, high.deflection)
-    columns = np.arange(len(body.demanding))
-    return _checked(body, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
 
 
 class _Gap(NamedTuple):
@@ -274,8 +247,14 @@ LEAST_MM = 0.1
 """mm of motion below which an interval is not divided: what is not shown to be clear counts as too close."""
 
 
-def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
-    moves = body.moves_mm(gap.low, gap.high)[gap.columns]
+def checked_between(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
+    """The verdict with candidates rejected that are not proven clear between two positions.
+
+    A structure moves by m between them, so a clearance changes by m at most: its least in between is at least
+    (low + high - m) / 2. Where that does not suffice, the interval is halved and measured in the middle.
+    """
+    weights = body.weights.structures[body.demanding[gap.columns]]
+    moves = abs(gap.high - gap.low) * body.breathing.amplitude_mm * np.abs(1 - weights)
     least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]  # no clearance falls faster than it moves
     short = (least < 0) & (moves > 0) & verdict.of(gap.rows).safe[:, None]
     rows, columns = np.asarray(short.any(axis=1)), np.asarray(short.any(axis=0))
@@ -292,8 +271,8 @@ def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
     amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
     close = _too_close(body, gap, left[bad], amount)
     verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
-    verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
-    return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
+    verdict = checked_between(body, verdict, gap._replace(high=middle, at_high=excess))
+    return checked_between(body, verdict, gap._replace(low=middle, at_low=excess))
 
 
 def _too_close(body: BreathingBody, gap: _Gap, left: Floats, amount: Floats) -> Verdict:

@@ -61,10 +61,7 @@ def ranked(case: Case, candidates: Candidates) -> Candidates:
 
 
 def ranked_by(candidates: Candidates, cost: Floats) -> Candidates:
-    """The safe candidates ranked by a cost of the caller's, smaller is better; equal costs keep their order.
-
-    Args:
-        cost: Shape (n,); rejected candidates' entries are not looked at.
+    """The safe candidates ranked by a cost (n,) of the caller's, smaller is better; equal costs keep their order.
 
     Raises:
         InputError: Another shape, or a safe candidate whose cost is not finite.

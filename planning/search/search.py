@@ -22,8 +22,8 @@ from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths, case_paths
 from puncture_twin.planning.search.bending import with_bending
-from puncture_twin.planning.search.candidate_chances import with_best_refined, with_chances, with_joint_chances
-from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
+from puncture_twin.planning.search.candidate_chances import with_best_chances, with_chances
+from puncture_twin.planning.search.candidates import ArmColumns, Candidates, ClearanceColumns, Path, Ranking
 from puncture_twin.planning.search.constraints import ArmReach, first_broken, skin_allows, with_reach
 from puncture_twin.planning.search.phases import with_breathing, with_breathing_reach
 from puncture_twin.planning.search.ranking import ranked, with_grid_cone
@@ -63,7 +63,7 @@ def search(
         candidates = with_chances(case, anatomy, candidates, chance, axes)
     candidates = ranked(case, candidates)  # cost, rank, Pareto front
     if chance is not None:  # chances of the best by sampling; ranks again if it rejects; of touching any structure
-        candidates = with_joint_chances(with_best_refined(candidates, chance), chance)
+        candidates = with_best_chances(candidates, chance)
     return candidates
 
 
@@ -93,17 +93,17 @@ def organ_candidates(
         theta=directions.theta,
         beta=directions.beta,
         outward_ct=outward,
-        verdict=first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle),
         path=Path(entry_ct=paths.entry_ct, length=paths.path_length, skin_angle=paths.skin_angle, tissue=tissue),
-        clearance=Clearance(
+        clearance=ClearanceColumns(
             structures=tuple(s.name for s in checked),
             margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
-            distance=clearances.clearance,
+            by_structure=clearances.clearance,
             least=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
         ),
         arm=ArmColumns.unknown(count),
         ranking=Ranking.none(count),
         safe_cone=np.full(count, np.nan),
+        verdict=first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle),
         grid=directions.grid,
     )
     bound = None if case.bending is None else case.bending.bound(needle.longest_path_mm)
@@ -117,8 +117,7 @@ def organ_candidates(
 class Blocking(NamedTuple):
     """What blocks n directions of a grid."""
 
-    structure: Ints32
-    """The first of ``anatomy.checked`` whose margin a direction breaks; -1 where none."""
+    structure: Ints32  # the first of ``anatomy.checked`` whose margin a direction breaks; -1 where none
     enters: Bools
     """Whether the constraints of the skin are satisfied; False where a structure of the body blocks already."""
 
@@ -134,24 +133,28 @@ def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, direct
     It accepts what `organ_candidates` accepts of a straight needle in a patient at rest, by maps of verdicts where the
     engine has them and by distances elsewhere (`tests/search/test_safe_map.py` compares both).
     """
-    outward, grid, body, radius = directions.outward_ct, directions.grid, anatomy.structures, case.needle.radius_mm
-    if fast := grid is not None and isinstance(engine, FastEngine):
-        verdict_map = VerdictMap(case.target_ct, grid, outward, case.T_ct_entry[:3, :3])
-        for number, structure in enumerate(body):
-            verdict_map.add(engine, number, structure, np.full(len(outward), case.needle.length_mm), radius)
-    free = np.flatnonzero(verdict_map.free) if fast else np.arange(len(outward))
+    needle, checked, body = case.needle, anatomy.checked, anatomy.structures
+    outward, max_skin_angle = directions.outward_ct, case.search.max_skin_angle
+    if directions.grid is None or not isinstance(engine, FastEngine):
+        paths = case_paths(case, anatomy.skin, outward)
+        lengths = axis_lengths(case, checked, paths.path_length, paths.skin_angle)
+        clearances = measure_clearances(
+            engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm
+        )
+        broken = clearances.violated
+        first = np.where(broken.any(axis=1), broken.argmax(axis=1), -1).astype(np.int32)
+        return Blocking(first, skin_allows(paths, needle, max_skin_angle))
+    verdict_map = VerdictMap(case.target_ct, directions.grid, outward, case.T_ct_entry[:3, :3])
+    lengths = np.full((len(outward), len(checked)), needle.length_mm)
+    for number, structure in enumerate(body):
+        verdict_map.add(engine, number, structure, lengths[:, number], needle.radius_mm)
+    free = np.flatnonzero(verdict_map.free)  # of the body; the others need no path
     paths = case_paths(case, anatomy.skin, outward[free])
     enters = np.zeros(len(outward), bool)
-    enters[free] = skin_allows(paths, case.needle, case.search.max_skin_angle)
-    lengths = np.full((len(outward), len(anatomy.checked)), case.needle.length_mm)
-    lengths[free] = axis_lengths(case, anatomy.checked, paths.path_length, paths.skin_angle)
-    if not fast:
-        broken = measure_clearances(
-            engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius
-        ).violated
-        return Blocking(np.where(broken.any(axis=1), broken.argmax(axis=1), -1).astype(np.int32), enters)
+    enters[free] = skin_allows(paths, needle, max_skin_angle)
+    lengths[free] = axis_lengths(case, checked, paths.path_length, paths.skin_angle)
     for number, structure in enumerate(anatomy.surroundings, start=len(body)):
-        verdict_map.add(engine, number, structure, lengths[:, number], radius)
+        verdict_map.add(engine, number, structure, lengths[:, number], needle.radius_mm)
     return Blocking(verdict_map.structure, enters)
 
 
@@ -170,8 +173,7 @@ def tissue_crossed(
 ) -> Floats:
     """Length of each path, target to skin, inside structures that may be crossed; shape (n,), mm.
 
-    These are structures of role ``traverse`` or ``target`` other than the target's own, and closed: an open surface has
-    no inside. Where structures are nested, each one counts.
+    These are closed ones of role ``traverse`` or ``target`` other than the target's own; nested, each one counts.
     """
     total = np.zeros(len(outward_ct))
     for structure in structures:

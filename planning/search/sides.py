@@ -23,7 +23,6 @@ LEAST_OPEN = 0.1
 LEAST_SEARCHED = 0.4
 """Fraction of a side's directions from which on a grid covers it: a grid about the front holds half of what is to the
 right and to the left."""
-
 ROUND_ABOUT = ("front", "back", "right", "left")
 """The sides that are reported; through feet and head no image shows skin."""
 NOT_SHOWN = "is where the image does not show the body"
@@ -38,12 +37,9 @@ class Side(NamedTuple):
     name: str
     open: float
     """Fraction of its solid angle from where a needle can come, whatever organs are in its path."""
-    searched: float
-    """The fraction that the case's grid holds."""
-    nearest_mm: float
-    """The shortest path to its skin; NaN where none is known."""
-    why: str
-    """What closes most of it; "" where it is open."""
+    searched: float  # the fraction that the case's grid holds
+    nearest_mm: float  # the shortest path to its skin; NaN where none is known
+    why: str  # what closes most of it; "" where it is open
 
     @property
     def is_open(self) -> bool:

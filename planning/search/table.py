@@ -56,7 +56,7 @@ def _path_columns(candidates: Any) -> dict[str, Any]:
         "min_clearance_mm": candidates.clearance.least,
     }
     for at, name in enumerate(candidates.clearance.structures):
-        columns[f"clearance_{name}_mm"] = candidates.clearance.distance[:, at]
+        columns[f"clearance_{name}_mm"] = candidates.clearance.by_structure[:, at]
     return {**columns, "tissue_mm": candidates.path.tissue}
 
 

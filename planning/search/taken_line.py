@@ -19,7 +19,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.skin import SkinPaths, skin_paths
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.strict_json import or_null
-from puncture_twin.planning.clearance.engine import Clearances, measure_clearances, normals_of
+from puncture_twin.planning.clearance.engine import MeasuredClearances, measure_clearances, normals_of
 from puncture_twin.planning.registration.fits import carried_along
 from puncture_twin.planning.search.constraints import first_broken
 from puncture_twin.planning.search.context import CaseContext
@@ -46,12 +46,9 @@ class Clear(NamedTuple):
     clearance_mm: float
     sd_mm: float
     """Of the clearance, by what the reading may err, of the piece that may come nearest; NaN where they intersect."""
-    margin_mm: float
-    """NaN of what may be crossed."""
-    depth_mm: float
-    """From the tip, along the needle, of the nearest point."""
-    p_touch: float
-    """To first order, with what the surface itself may lie off; NaN where they intersect."""
+    margin_mm: float  # NaN of what may be crossed
+    depth_mm: float  # from the tip, along the needle, of the nearest point
+    p_touch: float  # to first order, with what the surface itself may lie off; NaN where they intersect
 
     @property
     def sure(self) -> bool:
@@ -67,16 +64,11 @@ class Clear(NamedTuple):
 class LineCheck:
     """The verdict of a line."""
 
-    verdict: str
-    """`SAFE`, `UNCERTAIN`, or a code of `Reason`."""
-    structure: str
-    """Which one decides; empty where none does."""
-    each: tuple[Clear, ...]
-    """Every structure, nearest to its margin first."""
-    entry_ct: Floats
-    """Shape (3,), where it enters the skin; NaN where it does not."""
-    inserted_mm: float
-    """From there to the tip."""
+    verdict: str  # `SAFE`, `UNCERTAIN`, or a code of `Reason`
+    structure: str  # which one decides; empty where none does
+    each: tuple[Clear, ...]  # every structure, nearest to its margin first
+    entry_ct: Floats  # shape (3,), where it enters the skin; NaN where it does not
+    inserted_mm: float  # from there to the tip
 
     @property
     def safe(self) -> bool:
@@ -95,10 +87,11 @@ def check_line(context: CaseContext, path_ct: Floats, covs_ct: Floats) -> LineCh
     steps = np.diff(path_ct, axis=0)
     sizes = np.linalg.norm(steps, axis=1)
     starts = np.concatenate([[0.0], np.cumsum(sizes)[:-1]])
-    best, violated = _nearest(context, path_ct, covs_ct, starts)
-    paths = _skin(context, path_ct, steps / sizes[:, None], starts, sizes)
-    found = Clearances(best["clearance"][None], best["depth"][None], violated[None])
-    broken = first_broken(paths, found, checked, needle=case.needle, max_skin_angle=np.pi)
+    outward = steps / sizes[:, None]
+    best, violated = _nearest(context, path_ct, covs_ct, outward, starts, sizes)
+    paths = _skin(context, path_ct, outward, starts, sizes)
+    clearances = MeasuredClearances(best["clearance"][None], best["depth"][None], violated[None])
+    broken = first_broken(paths, clearances, checked, needle=case.needle, max_skin_angle=np.pi)
     margins = [one.margin_mm if one.demands_margin else np.nan for one in checked]
     columns = zip(best["clearance"], best["sd"], margins, best["depth"], best["touch"], strict=True)
     each = [Clear(one.name, *map(float, column)) for one, column in zip(checked, columns, strict=True)]
@@ -110,18 +103,18 @@ def check_line(context: CaseContext, path_ct: Floats, covs_ct: Floats) -> LineCh
     return LineCheck(verdict, structure, tuple(each), paths.entry_ct[0], float(paths.path_length[0]))
 
 
-def _nearest(context: CaseContext, path_ct: Floats, covs_ct: Floats, starts: Floats) -> tuple[dict[str, Floats], Bools]:
+def _nearest(
+    context: CaseContext, path_ct: Floats, covs_ct: Floats, outward_ct: Floats, starts: Floats, sizes: Floats
+) -> tuple[dict[str, Floats], Bools]:
     """Of each structure least clearance of all pieces, depth, deviation and chance to touch; which is violated."""
     case, checked, engine = context.case, context.anatomy.checked, context.engine
-    steps = np.diff(path_ct, axis=0)
-    sizes = np.linalg.norm(steps, axis=1)
     errors = context.pose_error or case.errors
     voxels = [one.voxel_ct for one in checked]
     surfaces = np.array([np.zeros((3, 3)) if errors is None else errors.surface_cov_ct(one) for one in voxels])
     k = len(checked)
     best = {name: np.full(k, np.inf) for name in ("clearance", "depth", "sure")} | {"touch": np.zeros(k)}
     violated = np.zeros(k, bool)
-    for row, (begin, outward) in enumerate(zip(path_ct[:-1], steps / sizes[:, None], strict=True)):
+    for row, (begin, outward) in enumerate(zip(path_ct[:-1], outward_ct, strict=True)):
         last = row == len(sizes) - 1
         length = max(case.needle.length_mm - starts[row], sizes[row]) if last else sizes[row]
         axes = engine.measure(begin, outward[None], np.full((1, k), length), shown=False)
@@ -160,16 +153,12 @@ class Aim(NamedTuple):
 
     kind: str
     """``accept``, ``deeper`` (x mm; below 0 back), ``turn`` (to the skin and on by an angle) or ``withdraw``."""
-    by_mm: float
-    """How much deeper, along the needle; of a turn how far back first."""
-    turn_deg: float
-    """Between the needle and the line from its entry to the target."""
+    by_mm: float  # how much deeper, along the needle; of a turn how far back first
+    turn_deg: float  # between the needle and the line from its entry to the target
     p_hit: float
     """The chance that the tip is in the target then, by what is known of the reading; NaN where unknown."""
-    lateral_mm: float
-    """By which the tip, or its line, passes the target then."""
-    verdict: str
-    """Of the line that the needle takes then."""
+    lateral_mm: float  # by which the tip, or its line, passes the target then
+    verdict: str  # of the line that the needle takes then
     structure: str
 
     @property
@@ -190,9 +179,9 @@ def next_aims(context: CaseContext, path_ct: Floats, covs_ct: Floats, forward_ct
         forward_ct: Shape (3,), unit, the direction in which it goes on.
     """
     target, tip, cov_ct = context.case.target_ct, path_ct[0], covs_ct[0]
-    away = target - tip
-    deeper = float(away @ forward_ct)
-    lateral = float(np.linalg.norm(away - deeper * forward_ct))
+    to_target = target - tip
+    deeper = float(to_target @ forward_ct)
+    lateral = float(np.linalg.norm(to_target - deeper * forward_ct))
     aims = [Aim("accept", 0.0, 0.0, hit_chance(context, tip, cov_ct[:3, :3]), lateral, now.verdict, now.structure)]
     if abs(deeper) >= LEAST_MM:
         end = tip + deeper * forward_ct

@@ -41,8 +41,7 @@ class Remedy(NamedTuple):
 class Goal:
     """A limit that is not satisfied, and the errors that would have to shrink for it."""
 
-    structure: str
-    """What is touched too likely; "" where the target is hit too unlikely."""
+    structure: str  # what is touched too likely; "" where the target is hit too unlikely
     limit: float
     stated: bool
     remedies: tuple[Remedy, ...]
@@ -81,13 +80,10 @@ class UncertaintyBreakdown:
     """Chances, error budget and unmet limits of one candidate."""
 
     p_hit: float
-    p_touch: Mapping[str, float]
-    """Structure to chance to touch it."""
-    p_touch_any: float
-    """Of any, min(1, sum)."""
+    p_touch: Mapping[str, float]  # structure to chance to touch it
+    p_touch_any: float  # of any, min(1, sum)
     budget: ErrorBudget
-    declaration: str
-    """Whether the markers' residuals agree with the declared errors, in one sentence."""
+    declaration: str  # whether the markers' residuals agree with the declared errors, in one sentence
     goals: tuple[Goal, ...]
     """Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit."""
     not_modelled: str
@@ -166,11 +162,9 @@ WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "to be 
 
 
 def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:
-    """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
+    """The uncertainty breakdown of a direction (3,) at joints (6,), rad, the tip on the target.
 
-    Args:
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q: Shape (6,), rad, the tip on the target.
+    Its chances are line-sampled as those of the table's best are.
     """
     needle = (outward_ct[None], q[None])
     chances = refined_chances(model, *needle, model.chances(*needle))

@@ -14,8 +14,6 @@ from puncture_twin.planning.case.entry import AngleGrid
 
 SQUARE_DEGREES = float(np.degrees(1.0) ** 2)
 """Square degrees in a steradian."""
-
-
 MOST_WINDOWS = 10
 """Windows that are listed to people."""
 

@@ -159,7 +159,7 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
         tape = None if case.space is Space.LOCAL else tape_to(anatomy.skin, point, np.asarray(up_axis(case)))
         places.append(MarkerPlace(f"M{number}", point, normal, float(point[2] - case.target_ct[2]), tape))
     unmet, near = tuple(_unmet(put, case.target_ct)), float(put.to_entry.min())
-    return Proposal(tuple(places), error, case.errors is not None, context.arm, near, unmet)
+    return Proposal(tuple(places), error, case.errors is not None, context.arm_note, near, unmet)
 
 
 def _unmet(put: _Skin, target_ct: Floats) -> Iterator[str]:

@@ -22,8 +22,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, read_only
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.text import Facts, Shown, brief, first_few, plural
 from puncture_twin.planning.case.case import bed_frame
-from puncture_twin.planning.collision.bodies import Body, Solid, arm_bodies, touch
-from puncture_twin.planning.collision.patient import FclSkin
+from puncture_twin.planning.collision.bodies import Body, FclSkin, Solid, arm_bodies, touch
 from puncture_twin.planning.collision.state_checker import PATIENT, SweptBodies
 from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
@@ -34,20 +33,15 @@ from puncture_twin.planning.search.context import CaseContext
 
 DISTANCE_MM, BASELINE_MM = 1000.0, 500.0
 """Of proposed cameras: from the target, and from each other. The shipped servo workcell has them so."""
-
 LOWEST, ELEVATIONS, AZIMUTHS = np.radians(20.0), 8, 36
 """Where the middle between proposed cameras is looked for: least height over the bed, steps up to straight above it,
 and steps around: 10 degrees each. Neither camera is lower."""
-
 STEPS = 7
 """Depths of the insertion at which is looked, from the standoff to the target."""
-
 BALL_MM = 4.0
 """Radius of a ball on the shaft. One on the holder lies around it, and is as much wider."""
-
 MARKER_MM = 5.0
 """A marker lies on the skin, whose surface may be read so far off: nearer to it nothing hides it."""
-
 CAMERA_MM, BETWEEN_MM = 80.0, 20.0
 """Radius of a ball about a proposed camera, its housing and its mount, that nothing is in at some states of the motion;
 at all others nothing is nearer than that less by the second."""
@@ -68,7 +62,6 @@ class Watched(NamedTuple):
 
 Names = NDArray[np.object_]
 """Texts, of any shape."""
-
 Surfaces = Sequence[tuple[str, TriangleMesh]]
 """Names and surfaces, CT frame, mm."""
 
@@ -77,19 +70,14 @@ Surfaces = Sequence[tuple[str, TriangleMesh]]
 class CameraView(Shown):
     """What two cameras see during an insertion."""
 
-    cameras_ct: Floats
-    """Shape (2, 3), mm."""
-    proposed: bool
-    """Whether the case left their places open."""
-    tip_to_target_mm: Floats
-    """Shape (k,): the depths of the insertion, from the standoff to the target."""
-    names: tuple[str, ...]
-    """What is to be seen: balls by their distance from the tip, then markers."""
+    cameras_ct: Floats  # shape (2, 3), mm
+    proposed: bool  # whether the case left their places open
+    tip_to_target_mm: Floats  # shape (k,): the depths of the insertion, from the standoff to the target
+    names: tuple[str, ...]  # what is to be seen: balls by their distance from the tip, then markers
     balls: int
     hidden: tuple[tuple[str, ...], ...]
     """For each depth and name, by what it is hidden from at least one camera; empty where both see it."""
-    clear: bool
-    """Whether nothing is or comes near the cameras; of proposed ones it is so."""
+    clear: bool  # whether nothing is or comes near the cameras; of proposed ones it is so
 
     @cached_property
     def seen(self) -> Bools:
@@ -181,10 +169,7 @@ def camera_view(context: CaseContext, plan: Plan | Watched) -> CameraView:
 
 
 def candidate_pairs(T_ct_bed: Floats) -> tuple[Floats, Floats]:
-    """Pairs of cameras about the origin of the bed frame, side by side and one above the other.
-
-    Args:
-        T_ct_bed: Shape (4, 4), mm, z up, its origin on the target.
+    """Pairs of cameras about the target, the origin of the bed frame, side by side and one above the other.
 
     Returns:
         Cameras, shape (n, 2, 3), CT mm, and the direction to the middle of each pair, shape (n, 3), unit.
@@ -227,8 +212,7 @@ def hidden_by(surfaces: Surfaces, points_ct: Floats, cameras_ct: Floats, near_mm
 class _Look(NamedTuple):
     """One depth of the insertion."""
 
-    left_mm: float
-    """Tip to target."""
+    left_mm: float  # tip to target
     arm: Surfaces
     balls: tuple[tuple[Floats, bool, bool], ...]
     """Of each ball: seven points, shape (7, 3), CT mm; whether it is in the body; whether it is around the holder."""

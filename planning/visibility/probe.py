@@ -27,8 +27,8 @@ from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.case.settings import Ultrasound
+from puncture_twin.planning.collision.bodies import FclSkin
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.patient import FclSkin
 from puncture_twin.planning.collision.two_arms import BetweenArms, handle_tool, head_body
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, outside_surface
 from puncture_twin.planning.geometry.containment import contains, first_crossing
@@ -41,38 +41,28 @@ from puncture_twin.planning.visibility.cameras import Watched
 HEAD_MM, HANDLE_MM, LENGTH_MM = (8.0, 30.0, 20.0), 40.0, 150.0
 """Of the probe: how much wider than its footprint the head is, how long, and how thick; the handle's diameter; flange
 to face. As the probe of the workcell that calibrates itself."""
-
 ASIDE, AROUND = np.radians(np.arange(10.0, 81.0, 5.0)), np.radians(np.arange(0.0, 360.0, 15.0))
 """Footprints that are looked at: angle of the image's middle from the needle, and of the image plane about it."""
-
 TILT = np.radians(30.0)
 """Between the image's middle and the skin's inward normal: farther a face of 20 mm lifts off."""
-
 RAYS = 21
 """Lines from the target to the footprint that must be free: every 2 mm of a face of 40 mm."""
-
 AIR_HU, AIR_STEP_MM, RIM_MM = -300.0, 1.0, 3.0
 """In a CT what is thinner is air; how densely a line is looked at; next to the skin voxels hold both."""
-
 CLEARANCE_MM = 4.0
 """What probe and its arm keep from needle, holder and the needle's arm, as where it calibrates itself, at states of the
 insertion that are so close that none between them is farther from one: so nothing touches there either."""
-
 BONE = (
     *("vertebrae, spine", "ribs", "costal cartilages, sternum", "pelvis", "limbs and girdles", "skull and face"),
     "devices",
 )
 """Groups of `planning.anatomy.default_roles` that no sound passes."""
-
 GAS = frozenset({"gas", "air", "pneumothorax"})
 """Words of a name that say it."""
-
 AIRY = ("lungs", "airways", "stomach and bowel")
 """Groups that hold air; of the last a CT says where."""
-
 ABOUT_UP, ABOUT_BED = (180, 135, 225, 90, 270), (90, -90, 60, -60, 120, -120)
 """Turns of the needle's arm about the target, degrees: where the second arm is assumed, in this order."""
-
 BASES_APART_MM = 300.0
 """The least distance of an assumed base from the needle's."""
 
@@ -106,7 +96,6 @@ WHY: Mapping[Ruled, tuple[str, str]] = MappingProxyType(
     }
 )
 """What is said of footprints, and what would let most of them pass."""
-
 STAGES = (tuple(Ruled)[6:], tuple(Ruled)[3:6], tuple(Ruled)[:3])
 """By arm, by sound, by skin: what came to a later stage says more."""
 
@@ -118,14 +107,10 @@ class ProbeView(Shown):
     T_ct_image: Floats | None
     """Shape (4, 4), mm: its origin in the middle of the face, x along the face toward the needle, y along the depth, z
     across the plane; None where there is no footprint."""
-    q_probe: Floats | None
-    """Shape (6,), rad, of the arm that holds it, or None."""
-    T_base_ct: Floats | None
-    """Shape (4, 4), mm, of that arm's base; None where no assumed place serves."""
-    assumed: bool
-    """Whether the case left that arm's place open."""
-    depth_mm: float
-    """From the face to the target, or NaN."""
+    q_probe: Floats | None  # shape (6,), rad, of the arm that holds it, or None
+    T_base_ct: Floats | None  # shape (4, 4), mm, of that arm's base; None where no assumed place serves
+    assumed: bool  # whether the case left that arm's place open
+    depth_mm: float  # from the face to the target, or NaN
     counts: Mapping[str, int]
     """How many footprints are ruled out by what, and how many are left or were not needed (``free``)."""
 
@@ -159,10 +144,7 @@ FREE = "free"
 
 
 def probe_view(context: CaseContext, plan: Plan | Watched) -> ProbeView:
-    """Where the probe goes while a plan's needle is inserted.
-
-    Args:
-        context: The case, with ``[ultrasound]``.
+    """Where the probe of a case with ``[ultrasound]`` goes while a plan's needle is inserted.
 
     Raises:
         InputError: The case declares no probe, or a stated base of its arm is in the patient.
@@ -188,14 +170,10 @@ class Footprints:
     """Footprints, a row each."""
 
     skin: Skin
-    target_ct: Floats
-    """Shape (3,), mm."""
-    T_ct_image: Floats
-    """Shape (n, 4, 4), mm, see `ProbeView`; NaN without skin."""
-    depth: Floats
-    """Shape (n,), mm, from the face to the target."""
-    ruled: Ints
-    """Shape (n,), what rules each out, by its place among `Ruled`; -1 where nothing has yet."""
+    target_ct: Floats  # shape (3,), mm
+    T_ct_image: Floats  # shape (n, 4, 4), mm, see `ProbeView`; NaN without skin
+    depth: Floats  # shape (n,), mm, from the face to the target
+    ruled: Ints  # shape (n,), what rules each out, by its place among `Ruled`; -1 where nothing has yet
 
     @property
     def counts(self) -> Mapping[str, int]:

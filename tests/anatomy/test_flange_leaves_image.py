@@ -193,7 +193,7 @@ def test_an_obstacle_counts_up_to_the_flange_of_its_direction(tmp_path, before, 
     found = context.check(0.0, 0.0)
     column = found.clearance.structures.index("lamp")
     assert found.safe[0] == safe
-    assert found.clearance.distance[0, column] == pytest.approx(max(before, 0.0) - 0.6, abs=1e-6)
+    assert found.clearance.by_structure[0, column] == pytest.approx(max(before, 0.0) - 0.6, abs=1e-6)
     assert safe or found.verdict.depth[0] <= 300.0
     assert context.cross_check(50).largest_mm < 1e-6
 

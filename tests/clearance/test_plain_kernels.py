@@ -12,7 +12,7 @@ from puncture_twin.planning.clearance.kernels.blocks import pack
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 from puncture_twin.planning.clearance.kernels.side_by_side import (
     BEYOND,
-    ROWS,
+    PAIR_ROWS,
     UNDECIDED,
     bring_into_frame,
     measure_lateral,
@@ -119,7 +119,7 @@ def frame(rng):
 def beside(rows, length, frames, origin, count=None):
     """`measure_lateral`, and `measure_marked` where it marks a pair, of one triangle each: distances, depths, marks."""
     count = len(rows) if count is None else count
-    pairs = np.full((ROWS, len(rows)), 7.0)
+    pairs = np.full((PAIR_ROWS, len(rows)), 7.0)
     pairs[11] = length
     for k, (u, e, f) in enumerate(frames):
         bring_into_frame(tuple(u), tuple(e), tuple(f), rows, k, tuple(origin), pairs, k)

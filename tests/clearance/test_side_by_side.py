@@ -8,7 +8,7 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES, lanes_at_most,
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 from puncture_twin.planning.clearance.kernels.side_by_side import (
     BEYOND,
-    ROWS,
+    PAIR_ROWS,
     UNDECIDED,
     bring_into_frame,
     measure_lateral,
@@ -70,7 +70,7 @@ def test_pairs_answer_what_one_triangle_answers(kind):
     rng = np.random.default_rng(7)
     axes, origin = _frames(rng, COUNT), np.array([30.0, -200.0, 410.0])
     triangles = _triangles(rng, axes, kind)
-    pairs = np.full((ROWS, COUNT), np.nan)
+    pairs = np.full((PAIR_ROWS, COUNT), np.nan)
     marks = _in_pairs(axes, triangles + np.tile(origin, 3), origin, LENGTH, pairs)
     expected = np.array(
         [axis_triangle(tuple(a[0]), LENGTH, *map(tuple, t.reshape(3, 3))) for a, t in zip(axes, triangles, strict=True)]

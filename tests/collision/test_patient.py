@@ -13,10 +13,18 @@ from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.collision.bodies import BODY_NAMES, LooseParts, Solid, arm_bodies, surface, touch
+from puncture_twin.planning.collision.bodies import (
+    PART_TRIANGLES,
+    FclSkin,
+    LooseParts,
+    Solid,
+    arm_bodies,
+    surface,
+    touch,
+)
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.patient import PART_TRIANGLES, FclSkin
+from puncture_twin.planning.collision.state_checker import BODY_NAMES
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 

@@ -155,7 +155,7 @@ def test_many_directions_are_what_the_search_says_of_each(context, candidates):
     rows = np.random.default_rng(3).permutation(len(candidates))[:200]
     found = pt.check_many(context, candidates.theta_deg[rows], candidates.beta_deg[rows])
     assert np.array_equal(found.verdict.reason, candidates.verdict.reason[rows])
-    assert np.allclose(found.clearance.distance, candidates.clearance.distance[rows], atol=1e-9)
+    assert np.allclose(found.clearance.by_structure, candidates.clearance.by_structure[rows], atol=1e-9)
     assert np.allclose(found.path.entry_ct, candidates.path.entry_ct[rows], atol=1e-9, equal_nan=True)
     assert found.grid is None and len(found) == 200
 
@@ -328,7 +328,7 @@ def test_an_engine_of_ones_own_measures_everything(context):
     mine = pt.prepare(case, arm=False, engine=WaryEngine)
     found, wider = pt.search(mine), pt.search(pt.prepare(case.replace(margins={"add_mm": 1.0}), arm=False))
     bolts = np.isin(found.clearance.structures, ("bolt_l", "bolt_h"))
-    assert np.array_equal(found.clearance.distance[:, bolts] < 2.0, wider.clearance.distance[:, bolts] < 3.0)
+    assert np.array_equal(found.clearance.by_structure[:, bolts] < 2.0, wider.clearance.by_structure[:, bolts] < 3.0)
     assert same_candidates(pt.search(pickle.loads(pickle.dumps(mine))), found)
     for wrong in (int, "exact", FastEngine([])):
         with refused("wrong_type" if wrong != "exact" else "unknown_engine"):

@@ -150,7 +150,7 @@ def test_the_verdict_is_that_of_check(context, planner, rng):
 def paths(context):
     """Safe directions and how much more than its margins each keeps: (theta, beta, slack)."""
     found = pt.search(context)
-    slack = np.nanmin(found.clearance.distance - found.clearance.margins, axis=1)
+    slack = np.nanmin(found.clearance.by_structure - found.clearance.margins, axis=1)
     rows = np.flatnonzero(found.safe)
     return np.column_stack([found.theta_deg, found.beta_deg, slack])[rows]
 
@@ -186,7 +186,7 @@ def test_a_tip_beyond_the_target_is_held_against_what_lies_behind(tmp_path):
 
 def test_what_breath_and_bending_take_is_not_spare():
     """10 mm and 4 mm of clearance over margins of 3 and 1; 5 mm at the breath's worst; 1.5 mm of bending."""
-    clearance = SimpleNamespace(distance=np.array([[10.0, 4.0, 0.2]]), margins=np.array([3.0, 1.0, np.nan]))
+    clearance = SimpleNamespace(by_structure=np.array([[10.0, 4.0, 0.2]]), margins=np.array([3.0, 1.0, np.nan]))
     breath = SimpleNamespace(clearance=np.array([5.0]))
     for breathing, bent, expected in ((None, None, 3.0), (breath, None, 2.0), (None, 1.5, 1.5), (breath, 1.5, 0.5)):
         deflection = None if bent is None else np.array([bent])

@@ -89,13 +89,13 @@ def least_slack(context, found):
     """Clearance beyond the margin of the structure nearest to its own, mm, by direction."""
     demanding = [k for k, one in enumerate(context.anatomy.checked) if one.demands_margin]
     margins = np.array([context.anatomy.checked[k].margin_mm for k in demanding])
-    return (found.clearance.distance[:, demanding] - context.case.needle.radius_mm - margins).min(axis=1)
+    return (found.clearance.by_structure[:, demanding] - context.case.needle.radius_mm - margins).min(axis=1)
 
 
 def clearances(context, found):
     """Distance of the axis from each structure, (directions, structures), in one order; mm."""
     order = np.argsort([one.name for one in context.anatomy.structures])
-    return found.clearance.distance[:, order]
+    return found.clearance.by_structure[:, order]
 
 
 @pytest.mark.parametrize(("spacing", "turn", "noise"), [("5", 0, "20"), ("2.5", 35, "40")])
@@ -153,7 +153,7 @@ def test_what_is_thinner_than_a_voxel_is_not_lost(tmp_path, capsys):
     voxel = np.linalg.norm([1.5, 1.5, 2.5])
     for name in THIN:
         column = [one.name for one in context.anatomy.structures].index(name)
-        lack = margin[name] - wanted.clearance.distance[:, column]
+        lack = margin[name] - wanted.clearance.by_structure[:, column]
         assert name in names and lack.max() > voxel
         assert not np.any(found.safe & (lack > voxel))
     assert found.safe.sum() > 50

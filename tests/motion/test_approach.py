@@ -376,7 +376,7 @@ def test_a_trajectory_is_sampled_anywhere_and_has_a_motion():
     trajectory = Trajectory(np.array([0.0, 1.0, 3.0]), np.array([[0.0] * 6, [1.0] * 6, [2.0] * 6]))
     assert trajectory.at(2.0).tolist() == [1.5] * 6
     assert trajectory.at(np.array([-1.0, 9.0])).tolist() == [[0.0] * 6, [2.0] * 6]
-    assert trajectory.duration_s == 3.0 and trajectory.max_speeds().tolist() == [1.0] * 6
+    assert trajectory.duration_s == 3.0 and trajectory.peaks().speed.tolist() == [1.0] * 6
     with pytest.raises(ValueError, match="read-only"):
         trajectory.q[0, 0] = 1.0
     with refused("no_motion"):

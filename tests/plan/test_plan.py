@@ -100,7 +100,7 @@ def test_the_plan_is_the_best_candidate_that_is_reached(carton, planned):
     ]
     assert speeds[0] <= 250.0 and speeds[1] <= 40.0 * (1 + 1e-3)
     for part in (plan.approach, plan.insertion):
-        assert (part.max_speeds() <= model.max_speeds + 1e-9).all()
+        assert (part.peaks().speed <= model.max_speeds + 1e-9).all()
     assert motion_contact(plan, carton.reach.checker) is None
 
 

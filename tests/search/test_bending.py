@@ -58,13 +58,13 @@ def test_what_lacks_the_clearance_to_bend_is_rejected_and_nothing_else(patient):
     """The bound of each path's length beside every margin; today's columns but the verdict's stay."""
     straight, bent = searched(patient, bending=None), searched(patient)
     bound = patient.case.bending.bound(150.0)
-    excess = (straight.clearance.distance - straight.clearance.margins)[:, 1:].min(axis=1)
+    excess = (straight.clearance.by_structure - straight.clearance.margins)[:, 1:].min(axis=1)
     np.testing.assert_array_equal(bent.safe, straight.safe & (excess >= bound.at(straight.path.length)))
     assert 0 < bent.safe.sum() < straight.safe.sum()
     new = straight.safe & ~bent.safe
     assert set(bent.verdict.reason[new]) == {"needle_bends"}
     row = np.flatnonzero(new)[0]
-    assert bent.verdict.amount[row] == straight.clearance.distance[row, 1:].min()
+    assert bent.verdict.amount[row] == straight.clearance.by_structure[row, 1:].min()
     assert f"{bent.deflection[row]:.2f} mm" in bent.verdict.detail[row]
     today, with_tissue = to_table(straight), to_table(bent)
     assert with_tissue.column_names == [*today.column_names, "deflection_bound_mm"]

@@ -77,7 +77,7 @@ def test_a_series_gives_the_verdicts_of_the_same_ct_in_nifti(scene):
     nifti, dicom = (prepare(scene / f"{name}.toml", arm=False) for name in ("nifti", "dicom"))
     one, other = nifti.search(), dicom.search()
     assert np.array_equal(one.verdict.reason, other.verdict.reason)
-    assert np.allclose(one.clearance.distance, other.clearance.distance, atol=1e-3, equal_nan=True)
+    assert np.allclose(one.clearance.by_structure, other.clearance.by_structure, atol=1e-3, equal_nan=True)
     assert np.allclose(one.path.length, other.path.length, atol=1e-3, equal_nan=True)
     assert one.safe.any()
     assert dicom.anatomy.warnings == tuple(line.replace("ct.nii.gz", "series") for line in nifti.anatomy.warnings)

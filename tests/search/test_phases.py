@@ -88,7 +88,7 @@ def test_phases_are_those_of_a_body_that_is_moved_and_searched_anew(patient, sta
     np.testing.assert_array_equal(found.breathing.safe_all_phases, static.safe & safe.all(axis=0))
     least = np.array([one.clearance.least for one in anew])[window][:, static.safe]
     np.testing.assert_allclose(found.breathing.clearance[static.safe], least.min(axis=0), atol=1e-9)
-    excess = np.array([(one.clearance.distance - one.clearance.margins)[:, 1:].min(axis=1) for one in anew])[window]
+    excess = np.array([(one.clearance.by_structure - one.clearance.margins)[:, 1:].min(axis=1) for one in anew])[window]
     entered = found.safe
     worst = breath.positions[window][excess[:, entered].argmin(axis=0)]
     np.testing.assert_array_equal(found.breathing.worst_phase[entered], worst)
@@ -106,7 +106,7 @@ def test_what_passes_the_needle_between_two_positions_is_found(patient, static):
     ends = static.safe & safe[0] & safe[-1]
     assert np.sum(ends & ~safe.all(axis=0)) > 0  # the example has some that only the way between rejects
     lost = ends & ~found.safe & safe.all(axis=0)
-    excess = np.min([(one.clearance.distance - one.clearance.margins)[:, 1:].min(axis=1) for one in anew], axis=0)
+    excess = np.min([(one.clearance.by_structure - one.clearance.margins)[:, 1:].min(axis=1) for one in anew], axis=0)
     assert np.all(excess[lost] < 0.1 + 30.0 * 1.4 / 60 / 2)
 
 

@@ -46,7 +46,7 @@ def test_every_structure_is_closed_and_the_maps_agree_by_and_large(searches, rec
         rows = found.safe
         assert rows.sum() > 20
         demanding = ~np.isnan(found.clearance.margins)
-        assert (found.clearance.distance[rows][:, demanding] >= found.clearance.margins[demanding] - 1e-4).all()
+        assert (found.clearance.by_structure[rows][:, demanding] >= found.clearance.margins[demanding] - 1e-4).all()
         assert (found.path.length[rows] <= context.case.needle.shaft_mm).all()
         assert (found.path.skin_angle[rows] <= context.case.search.max_skin_angle).all()
     verdicts = [searches[version][1].safe for version in ("v1", "v2")]

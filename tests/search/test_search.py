@@ -58,7 +58,7 @@ def test_clearances_equal_the_analytic_truth(carton, found, rng):
         for column, name in enumerate(s.name for s in carton.anatomy.structures):
             truth = max(carton_field(name)(points).min(), 0) - carton.case.needle.radius_mm
             if name != "bolt_m":  # the target lies in its end face, where mesh and field differ by rounding
-                assert found.clearance.distance[row, column] == pytest.approx(truth, abs=0.02)
+                assert found.clearance.by_structure[row, column] == pytest.approx(truth, abs=0.02)
 
 
 def test_the_table_holds_what_was_found(carton, found, tmp_path):
@@ -119,7 +119,7 @@ def test_other_engines_give_the_same_or_are_caught(carton, found):
     plain = prepare(folder() / "carton" / "case_m.toml", arm=False, engine="fcl").search()
     np.testing.assert_array_equal(plain.verdict.reason, found.verdict.reason)
     np.testing.assert_array_equal(plain.verdict.structure, found.verdict.structure)
-    np.testing.assert_allclose(plain.clearance.distance, found.clearance.distance, atol=1e-9)
+    np.testing.assert_allclose(plain.clearance.by_structure, found.clearance.by_structure, atol=1e-9)
     np.testing.assert_array_equal(plain.ranking.rank, found.ranking.rank)
     assert carton.cross_check(40).pairs == 40 * 4  # three bolts and the table
 

@@ -41,7 +41,7 @@ def test_a_needle_on_a_direction_has_that_directions_clearances(context, pieces)
         steps = np.linspace(0.0, 60.0 if pieces == 1 else context.case.needle.length_mm, pieces + 1)  # out of the skin
         path = context.case.target_ct + np.outer(steps, outward)
         line = check_line(context, path, exact(path))
-        known = dict(zip(candidates.clearance.structures, candidates.clearance.distance[row], strict=True))
+        known = dict(zip(candidates.clearance.structures, candidates.clearance.by_structure[row], strict=True))
         outside = {one.name for one in context.anatomy.surroundings}  # a plan's needle comes from farther out
         found = {one.name: one.clearance_mm for one in line.each}
         assert all(found[name] >= known.pop(name) - 1e-6 and found.pop(name) > 0 for name in outside)

@@ -9,7 +9,7 @@ from puncture_twin.planning.anatomy.skin import SkinPaths
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.clearance.engine import Clearances
+from puncture_twin.planning.clearance.engine import MeasuredClearances
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.constraints import closest_miss, first_broken, worst_violation
 
@@ -25,7 +25,7 @@ def structure(name, margin=2.0, role=Role.AVOID):
 
 def nothing(count):
     empty = np.empty((count, 0))
-    return Clearances(empty, empty, empty.astype(bool))
+    return MeasuredClearances(empty, empty, empty.astype(bool))
 
 
 def rated(skin_rows, clearances=None, structures=()):
@@ -65,7 +65,7 @@ def test_each_reason_of_the_skin_and_its_numbers():
 
 
 def test_the_first_broken_constraint_gives_the_reason():
-    near = Clearances(np.array([[0.5]] * 6), np.array([[40.0]] * 6), np.ones((6, 1), bool))
+    near = MeasuredClearances(np.array([[0.5]] * 6), np.array([[40.0]] * 6), np.ones((6, 1), bool))
     rows = [
         (NAN, NAN, 90, 70),
         (NAN, NAN, 90, NAN),
@@ -94,7 +94,7 @@ def test_the_structure_that_lacks_most_is_named():
     structures = [structure("a", 2.0), structure("b", 7.0), structure("c", 1.0)]
     rows = [(100, 10, NAN, NAN)] * 4
     same(
-        rated(rows, Clearances(clearance, depth, violated), structures),
+        rated(rows, MeasuredClearances(clearance, depth, violated), structures),
         [
             (Reason.TOO_CLOSE, "b", 20, 4),
             (Reason.TOO_CLOSE, "a", 30, 1),
@@ -103,12 +103,14 @@ def test_the_structure_that_lacks_most_is_named():
         ],
     )
     structures = tuple(structure(name, margin) for name, margin in (("a", 2.0), ("b", 5.0), ("c", 1.0)))
-    clearances = Clearances(
+    clearances = MeasuredClearances(
         np.array([[1.0, 4.0, 0.0]] * 2), np.array([[30.0, 20, 50], [5, 20, 4]]), np.ones((2, 3), bool)
     )
     assert worst_violation(clearances, structures).tolist() == [1, 2]
     assert worst_violation(nothing(3), ()).tolist() == [0, 0, 0]
-    clearances = Clearances(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[30.0, 20], [30, 20]]), np.ones((2, 2), bool))
+    clearances = MeasuredClearances(
+        np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[30.0, 20], [30, 20]]), np.ones((2, 2), bool)
+    )
     structures = [structure("fog", 2.0, Role.UNKNOWN), structure("vessel", 2.0)]
     same(
         rated([(100, 10, NAN, NAN)] * 2, clearances, structures),
@@ -118,7 +120,7 @@ def test_the_structure_that_lacks_most_is_named():
 
 def rejected(reasons, distance=(), margins=()):
     wanted = np.array([reason.value for reason in reasons], dtype=object)
-    clear = SimpleNamespace(distance=np.array(distance, float), margins=np.array(margins, float))
+    clear = SimpleNamespace(by_structure=np.array(distance, float), margins=np.array(margins, float))
     return SimpleNamespace(verdict=SimpleNamespace(reason=wanted), clearance=clear)
 
 

@@ -14,7 +14,7 @@ from scipy.special import chdtrc, chdtri
 from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count, uncounted
-from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.guidance.stereo.ball import Detector, image_detector, in_space, look_at
@@ -154,7 +154,7 @@ class Session:
 
 def run_session(
     case: ServoCase, seed: int, *, targets: tuple[str, ...] | None = None, detector_of: DetectorOf | None = None,
-    empty: StateChecker | None = None, record: Path | None = None,
+    empty: CellChecker | None = None, record: Path | None = None,
 ) -> Session:  # fmt: skip
     """Run a whole session in a workcell drawn from a seed; `record` is an empty folder for all that the devices say.
 
@@ -248,7 +248,7 @@ def _outcome(plant: StereoPlant, believed: NeedleError | None, target: int) -> N
     return needle_outcome(believed, plant.workcell.needle_m(plant.rests[-1], target), radius_mm)
 
 
-def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> ServoTrial:
+def run_trial(case: ServoCase, seed: int, empty: CellChecker | None = None) -> ServoTrial:
     """The trial of one seed; a session that fails becomes a trial with its reason. Arguments as of `run_session`."""
     try:
         return run_session(case, seed, empty=empty).trial

@@ -59,8 +59,8 @@ def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
     demanding = np.flatnonzero(np.isfinite(candidates.clearance.margins))
     if len(demanding) == 0:
         return "", math.nan
-    best = demanding[np.argmin(candidates.clearance.distance[row, demanding])]
-    return candidates.clearance.structures[best], float(candidates.clearance.distance[row, best])
+    best = demanding[np.argmin(candidates.clearance.by_structure[row, demanding])]
+    return candidates.clearance.structures[best], float(candidates.clearance.by_structure[row, best])
 
 
 def carried_mm(scan: Any | None) -> tuple[int, str]:

@@ -23,7 +23,6 @@ from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
 ROUND_SIDES = 48
 """Sides of the prism about a cylinder: up to 0.2 % wider than it is (0.1 mm at a radius of 50 mm)."""
-
 Read = Callable[[str], bytes]
 """The content of a mesh file, by its address in the URDF."""
 
@@ -31,10 +30,8 @@ Read = Callable[[str], bytes]
 class BodyShape(NamedTuple):
     """A shape of one of the arm's bodies."""
 
-    mesh: TriangleMesh
-    """In the shape's own frame, mm."""
-    T_body_shape: Floats
-    """Shape (4, 4), mm."""
+    mesh: TriangleMesh  # in the shape's own frame, mm
+    T_body_shape: Floats  # shape (4, 4), mm
 
 
 def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tuple[BodyShape, ...], ...]:
@@ -110,14 +107,10 @@ class ArmUrdf:
 
     text: bytes
     document: UrdfDocument
-    chain: ArmChain
-    """The document's six joints and seven bodies."""
-    lengths_mm: tuple[float, ...]
-    """d1, a2, a3, d4, d5, d6."""
-    T_base_root: Floats
-    """Shape (4, 4), mm: the URDF's root in the controller's base frame."""
-    shapes: tuple[tuple[BodyShape, ...], ...]
-    """Of each of the seven bodies, in its own frame."""
+    chain: ArmChain  # the document's six joints and seven bodies
+    lengths_mm: tuple[float, ...]  # d1, a2, a3, d4, d5, d6
+    T_base_root: Floats  # shape (4, 4), mm: the URDF's root in the controller's base frame
+    shapes: tuple[tuple[BodyShape, ...], ...]  # of each of the seven bodies, in its own frame
 
     @property
     def where(self) -> Path:
@@ -154,6 +147,4 @@ def read_arm_urdf(data: bytes, where: Path, *, flange: str, read: Read, T_base_r
     """
     document = parse_urdf(data, where)
     chain = arm_chain(document, flange)
-    found = ur_lengths(chain, document, T_base_root)
-    shapes = body_shapes(chain, document, read)
-    return ArmUrdf(data, document, chain, found.lengths_mm, found.T_base_root, shapes)
+    return ArmUrdf(data, document, chain, *ur_lengths(chain, document, T_base_root), body_shapes(chain, document, read))

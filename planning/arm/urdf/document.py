@@ -22,28 +22,20 @@ Element = ElementTree.Element
 
 MM_PER_M = 1000.0
 """URDFs speak metres."""
-
 MOST_BYTES = 10_000_000
 """Bytes of a URDF: the largest of a whole humanoid has a tenth of it."""
-
 MOST_LINKS = 1000
 """Of a URDF: an arm has ten."""
-
 MOST_SIZE_MM = 5000.0
 """Of a box or a cylinder in a link: no arm that can be planned for here has a longer one."""
-
 SHAPES = {"mesh": ("filename",), "box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
 """Kinds of shape that URDF knows, and what each must state."""
-
 JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 """Kinds of joint that URDF knows."""
-
 PLAIN = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")
 """Names of links and joints: they are written into programs of robots."""
-
 TAKEN = ("holder", "needle", "needle_holder", "needle_tip", "tool")
 """Names of what the flange carries."""
-
 LIMITS = ("lower", "upper", "velocity", "effort")
 
 ALLOWED = "a URDF: one <robot> with links and joints, as ROS reads it"
@@ -55,12 +47,9 @@ Named = TypeVar("Named", bound="UrdfLink | UrdfJoint")
 class UrdfShape:
     """One collision shape of a link."""
 
-    kind: str
-    """One of ``SHAPES``."""
-    T_link_shape: Floats
-    """Shape (4, 4), mm."""
-    address: str
-    """Of a mesh, as the URDF states it; else ""."""
+    kind: str  # one of ``SHAPES``
+    T_link_shape: Floats  # shape (4, 4), mm
+    address: str  # of a mesh, as the URDF states it; else ""
     size: Floats
     """Factors of a mesh's axes (3,); a box's edges (3,), a cylinder's radius and length (2,), a sphere's radius (1,),
     mm."""
@@ -71,12 +60,9 @@ class UrdfLink:
     """One link."""
 
     name: str
-    collisions: tuple[UrdfShape, ...]
-    """What it is made of for contacts."""
-    drawn: bool
-    """Whether it has a visual shape."""
-    weighs: bool
-    """Whether it states a mass and a tensor of inertia that physics can use."""
+    collisions: tuple[UrdfShape, ...]  # what it is made of for contacts
+    drawn: bool  # whether it has a visual shape
+    weighs: bool  # whether it states a mass and a tensor of inertia that physics can use
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +70,12 @@ class UrdfJoint:
     """One joint."""
 
     name: str
-    kind: str
-    """One of ``JOINTS``."""
+    kind: str  # one of ``JOINTS``
     parent: str
     child: str
-    T_parent_child: Floats
-    """Shape (4, 4), mm, at the angle zero."""
-    axis: Floats
-    """Shape (3,), unit, in the child's frame."""
-    limits: Mapping[str, float]
-    """Those of ``LIMITS`` that are stated: rad, rad/s, N m."""
+    T_parent_child: Floats  # shape (4, 4), mm, at the angle zero
+    axis: Floats  # shape (3,), unit, in the child's frame
+    limits: Mapping[str, float]  # those of ``LIMITS`` that are stated: rad, rad/s, N m
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,18 +83,15 @@ class UrdfDocument:
     """A whole URDF."""
 
     name: str
-    links: Mapping[str, UrdfLink]
-    """By name, in the file's order."""
-    joints: tuple[UrdfJoint, ...]
-    """In the file's order."""
+    links: Mapping[str, UrdfLink]  # by name, in the file's order
+    joints: tuple[UrdfJoint, ...]  # in the file's order
     where: Path
 
 
 def parse_urdf(data: bytes, where: Path) -> UrdfDocument:
     """The links and joints of a URDF.
 
-    Raises:
-        InputError: It is no well-formed XML, no URDF, or says something that is not understood.
+    Raises InputError: It is no well-formed XML, no URDF, or says something that is not understood.
     """
     root = _root(data, where)
     name = check_name(root.get("name", ""), "<robot>", where=where)

@@ -24,47 +24,35 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rot
 
 SQUARE_RAD = 1e-4
 """How far an axis may be from where a UR has it: 1.5708 for a right angle is off by 4e-6, 1.57 by 8e-4."""
-
 OFF_MM = 0.05
 """mm by which an axis' place and the flange's may be off: what a UR repeats. Rounded angles leave 0.005 mm at a
 metre."""
-
 DIGITS_MM = 6
 """Decimals of a length: a URDF's right angles are rounded, so that its chain gives 89.15899999999999."""
-
 DIGITS_TURN = 9
 """Decimals of the base's rotation, for the same reason."""
-
 BASE = "base"
 """The link that ROS has for the controller's base frame."""
-
 DIRECTIONS = np.array([[0, 0, 1], [0, -1, 0], [0, -1, 0], [0, -1, 0], [0, 0, -1], [0, -1, 0]], dtype=np.float64)
 """Directions of a UR's six axes at the angle zero, base frame."""
-
 R_BASE_FLANGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Orientation of a UR's flange at the angle zero, base frame."""
-
 AS_UR = "six axes like a UR's, with the same zero and sense of rotation (docs/how-to/own-arm.md)"
 
 
 class UrLengths(NamedTuple):
     """Denavit-Hartenberg lengths of a chain that is a UR's, and its root in the controller's base frame."""
 
-    lengths_mm: tuple[float, ...]
-    """d1, a2, a3, d4, d5, d6."""
-    T_base_root: Floats
-    """Shape (4, 4), mm: the URDF's root in the controller's base frame."""
+    lengths_mm: tuple[float, ...]  # d1, a2, a3, d4, d5, d6
+    T_base_root: Floats  # shape (4, 4), mm: the URDF's root in the controller's base frame
 
 
 class _Axes(NamedTuple):
     """The six axes and the flange at the angle zero."""
 
-    points: Floats
-    """Shape (6, 3), mm."""
-    directions: Floats
-    """Shape (6, 3), unit."""
-    T_flange: Floats
-    """Shape (4, 4), mm."""
+    points: Floats  # shape (6, 3), mm
+    directions: Floats  # shape (6, 3), unit
+    T_flange: Floats  # shape (4, 4), mm
 
     def moved(self, T: Floats) -> _Axes:
         """The axes in another frame."""
@@ -160,10 +148,8 @@ def _other(chain: ArmChain, joint: int, what: str, document: UrdfDocument) -> In
 
 MOST_RAD = 4.0 * math.pi
 """Beyond two whole turns either way a limit is in degrees, or is none."""
-
 MOST_RAD_S = 4.0 * math.pi
 """Twice as fast as any joint of a UR: beyond, a speed is in degrees."""
-
 ROUNDING_RAD = 1e-4
 """rad by which a stated limit may exceed the URDF's: 6.2832 for a whole turn."""
 
@@ -171,21 +157,16 @@ ROUNDING_RAD = 1e-4
 class JointLimits(NamedTuple):
     """Angle, speed and torque limits of six joints."""
 
-    angles: Floats
-    """Shape (6, 2), rad."""
-    speeds: Floats
-    """Shape (6,), rad/s."""
-    torques: Floats
-    """Shape (6,), N m."""
+    angles: Floats  # shape (6, 2), rad
+    speeds: Floats  # shape (6,), rad/s
+    torques: Floats  # shape (6,), N m
 
 
 class StatedLimits(NamedTuple):
     """Limits that a case states; None where it leaves them to the arm."""
 
-    angles: Floats | None = None
-    """Shape (6, 2), rad."""
-    speeds: Floats | None = None
-    """Shape (6,), rad/s."""
+    angles: Floats | None = None  # shape (6, 2), rad
+    speeds: Floats | None = None  # shape (6,), rad/s
 
 
 NOTHING_STATED = StatedLimits()
@@ -267,26 +248,21 @@ class Member:
     """A link of one of the arm's seven rigid bodies, with what is fixed to it."""
 
     link: UrdfLink
-    T_body_link: Floats
-    """Shape (4, 4), mm, in the frame of the body's first link."""
+    T_body_link: Floats  # shape (4, 4), mm, in the frame of the body's first link
 
 
 @dataclass(frozen=True, eq=False)
 class ArmChain:
     """An arm as a chain of seven rigid bodies."""
 
-    joints: tuple[UrdfJoint, ...]
-    """The six joints, from the base on."""
+    joints: tuple[UrdfJoint, ...]  # the six joints, from the base on
     T_body_joint: Floats
     """Shape (6, 4, 4), mm: each joint's frame at the angle zero, in that of the body before it."""
     bodies: tuple[tuple[Member, ...], ...]
     """For each of the seven bodies its links: the one that the joint moves (or the root) first."""
-    flange: str
-    """The link in whose frame the needle is mounted."""
-    T_body_flange: Floats
-    """Shape (4, 4), mm, in the frame of the last body."""
-    beyond: frozenset[str]
-    """Names of links that are fixed to the flange."""
+    flange: str  # the link in whose frame the needle is mounted
+    T_body_flange: Floats  # shape (4, 4), mm, in the frame of the last body
+    beyond: frozenset[str]  # names of links that are fixed to the flange
 
     def body_poses(self, T_base_root: Floats, q: Floats) -> Floats:
         """T_base_body of the seven bodies at a configuration (6,), rad, shape (7, 4, 4), mm."""

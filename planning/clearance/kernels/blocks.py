@@ -32,10 +32,8 @@ class Blocks:
     """Shape (16 b, 9), corners in block order, mm; the last block is filled up with its last triangle."""
     local: NDArray[np.float32]
     """Shape (b, 9, 16), float32, the same corners relative to their block's centre."""
-    center: Floats
-    """Shape (nodes, 3), c, all levels one after the other, mm."""
-    disc: NDArray[np.float32]
-    """Shape (5, nodes), float32, the normal n, rho and h, rounded outward."""
+    center: Floats  # shape (nodes, 3), c, all levels one after the other, mm
+    disc: NDArray[np.float32]  # shape (5, nodes), float32, the normal n, rho and h, rounded outward
     base: NDArray[np.int64]
     """Shape (levels,), the group of 16 with which each level starts; levels fill whole groups."""
 
@@ -60,10 +58,10 @@ def pack(mesh: TriangleMesh) -> Blocks:
     block_discs(triangles, local, center, disc)
     for level in range(1, len(counts)):
         parent_discs(center, disc, base[level - 1], counts[level - 1], base[level])
-    return Blocks(triangles, local, center, _outward(disc), base[:-1] // LANES)
+    return Blocks(triangles, local, center, _rounded_outward(disc), base[:-1] // LANES)
 
 
-def _outward(disc: Floats) -> NDArray[np.float32]:
+def _rounded_outward(disc: Floats) -> NDArray[np.float32]:
     """Convert to float32, radius and thickness grown by more than the rounding of anything that made them.
 
     A rounded normal is rotated by up to 6e-8: what lies at the rim of a wide, flat disc rises by as much of its radius.
@@ -96,10 +94,9 @@ def _fill(vertices, faces, order, triangles):  # type: ignore[no-untyped-def]  #
                 triangles[row, 3 * corner + x] = vertices[vertex, x]
 
 
-PARALLEL = 1e-6
-"""Length of a block's mean normal over its triangles' area, below which the normal is not used."""
-
-FAINT = 1e-140
+CANCELLED_FRACTION = 1e-6
+"""Length of a block's mean normal over its triangles' area, below which it is rounding: the normals cancel."""
+LEAST_NORMAL_MM2 = 1e-140
 """Length of a mean normal, mm^2, below which it is not used: its square is near the least number, and inexact."""
 
 
@@ -168,7 +165,7 @@ def _mean_normal(corners):  # type: ignore[no-untyped-def]  # numba infers
         sign = -1.0 if _dot(normal, first) < 0.0 else 1.0
         x, y, z = x + sign * normal[0], y + sign * normal[1], z + sign * normal[2]
     norm = np.sqrt(x * x + y * y + z * z)
-    if not norm > max(PARALLEL * area, FAINT):
+    if not norm > max(CANCELLED_FRACTION * area, LEAST_NORMAL_MM2):
         return 0.0, 0.0, 1.0
     return x / norm, y / norm, z / norm
 
@@ -205,7 +202,7 @@ def _mean_of_discs(disc, low, high):  # type: ignore[no-untyped-def]  # numba in
         sign = 1.0 if _dot(n, first) >= 0.0 else -1.0
         x, y, z = x + sign * n[0] * square, y + sign * n[1] * square, z + sign * n[2] * square
     norm = np.sqrt(_dot((x, y, z), (x, y, z)))
-    return (x / norm, y / norm, z / norm) if norm > FAINT else (0.0, 0.0, 1.0)
+    return (x / norm, y / norm, z / norm) if norm > LEAST_NORMAL_MM2 else (0.0, 0.0, 1.0)
 
 
 @allocation_free(nogil=True)

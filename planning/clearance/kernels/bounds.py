@@ -12,32 +12,25 @@ from numba import types
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.lanes import Arguments, Vector, intrinsic, least, most
 
-THREE = types.UniTuple(types.float32, 3)  # type: ignore[no-untyped-call]  # numba has no types
-
-NEVER = np.float32(1e18)
+FLOAT32_TRIPLE = types.UniTuple(types.float32, 3)  # type: ignore[no-untyped-call]  # numba has no types
+"""Numba's type of a direction that is handed over as three numbers."""
+BOUND_BEHIND_TARGET = np.float32(1e18)
 """The bound of what lies behind the target: nothing there is nearer to an axis than to the target itself."""
-
 SINE_SLACK = np.float32(1e-5)
 """Added to 1 - q^2: many times float32's rounding of it."""
-
 COSINE_SLACK = np.float32(2e-6)
 """Added to |q|: many times float32's rounding of it."""
-
 TINY = np.float32(1e-30)
 """Keeps a division finite; far below any square of a length that matters."""
-
 HUGE = np.float32(3e38)
 """More than any square of a length here."""
-
-ROOT = np.float32(1 - 1e-6)
+ROOT_ROUNDED_DOWN = np.float32(1 - 1e-6)
 """Factor that lowers a bound by more than the rounding of its root to float32."""
-
-SOONER = np.float32(1e-6)
+DEPTH_ORDER = np.float32(1e-6)
 """Taken from a bound for each mm below the needle's top: of discs that an axis intersects (all of bound 0), the first
 then has the least bound, and is tested first."""
-
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-
+"""Of float32: beside a Python number the arithmetic would become float64."""
 FAST = {"reassoc", "nsz", "contract", "arcp"}
 """What a vectoriser may do with these sums; their slack allows for it."""
 
@@ -52,7 +45,7 @@ def disc_bounds(  # type: ignore[no-untyped-def]  # numba's own types
         lateral = |w| - rho sqrt(1 - q^2) - h q,    w = c - (c.u) u,    q = |n.w| / |w|,    beyond = c.u - R - L
 
     of a disc with centre c from the target, normal n, radius rho, half-thickness h, R = hypot(rho, h), and a needle of
-    length L. A disc wholly behind the target has the bound `NEVER`.
+    length L. A disc wholly behind the target has the bound `BOUND_BEHIND_TARGET`.
 
     Args:
         typing_context: Numba's; not given by the caller.
@@ -65,7 +58,7 @@ def disc_bounds(  # type: ignore[no-untyped-def]  # numba's own types
         bounds: Shape (m, 16), float32; row ``first`` is written.
         first: See ``bounds``.
     """
-    signature = types.void(nodes, types.int64, THREE, *(types.float32,) * 3, bounds, types.int64)
+    signature = types.void(nodes, types.int64, FLOAT32_TRIPLE, *(types.float32,) * 3, bounds, types.int64)
     return signature, _write_disc_bounds
 
 
@@ -84,9 +77,9 @@ def _write_disc_bounds(context, builder, signature, arguments):  # type: ignore[
     lateral = most(w - rho * sine - h * (q + COSINE_SLACK) - (rho + h) * slack * inverse, 0.0)
     beyond = most(t - radius - length, 0.0)
     ahead = t + radius + chord * reach + slack  # no point of the disc is deeper on any axis of the cone
-    bound = (lateral * lateral + beyond * beyond).root() * ROOT
-    bound = (ahead > 0.0).choose(bound - (chord * least(ahead, length) + slack + slack), NEVER)
-    given.write(6, 7, bound + (least(t, length) - length) * SOONER)
+    bound = (lateral * lateral + beyond * beyond).root() * ROOT_ROUNDED_DOWN
+    bound = (ahead > 0.0).choose(bound - (chord * least(ahead, length) + slack + slack), BOUND_BEHIND_TARGET)
+    given.write(6, 7, bound + (least(t, length) - length) * DEPTH_ORDER)
     return context.get_dummy_value()
 
 
@@ -107,7 +100,9 @@ def line_distances(  # type: ignore[no-untyped-def]  # as above
         squares: Shape (m, 16), float32; row ``first`` is written, mm^2.
         first: See ``squares``.
     """
-    signature = types.void(local, types.int64, THREE, THREE, *(types.float32,) * 3, squares, types.int64)
+    signature = types.void(
+        local, types.int64, FLOAT32_TRIPLE, FLOAT32_TRIPLE, *(types.float32,) * 3, squares, types.int64
+    )
     return signature, _write_line_distances
 
 

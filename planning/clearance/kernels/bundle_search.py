@@ -22,20 +22,18 @@ from puncture_twin.planning.clearance.kernels.side_by_side import (
 ROUNDING = np.float32(4e-6)
 """Fraction of its corners' distance from the line by which a float32 distance may err
 (docs/concepts/fast-search.md)."""
-
 AREA_ROUNDING = np.float32(2e-6)
 """Fraction of that distance's square by which a float32 edge function may err."""
-
-SINGLE = np.float32(2e-7)
+SINGLE_CHORD = np.float32(2e-7)
 """Chord of one direction: what float32 takes from a unit vector."""
-
-GROWN = np.float32(1 + 1e-6)
-"""More than float32 takes from a root and a product."""
-
-SLOPE = np.float32(0.05)
+ROUNDED_UP = np.float32(1 + 1e-6)
+"""Factor that raises a number by more than float32 takes from a root and a product."""
+LEAST_SLOPE = np.float32(0.05)
 """Cosine between an axis and a disc's normal below which the depth of their intersection is not bounded by the slab."""
-
-THREE, FOUR = np.float32(3), np.float32(4)
+AREA_SLACKS = np.float32(3)
+"""Slacks, times the distance from the line, that an edge function may err by (docs/concepts/fast-search.md)."""
+OFFSET_SLACKS = np.float32(4)
+"""Slacks that a sum of products of coordinates is allowed to err by: a plane's offset c.n, or a corner's distance."""
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -85,7 +83,7 @@ def _most_promising(needle, groups, low, high, scratch, answer):  # type: ignore
         length = np.float32(needle.length[low + m])
         for group in range(groups):
             row = m * groups + group
-            disc_bounds(scratch.chosen, group, u, SINGLE, length, needle.slack, scratch.bounds, row)
+            disc_bounds(scratch.chosen, group, u, SINGLE_CHORD, length, needle.slack, scratch.bounds, row)
             bound = least_of(scratch.bounds, row)
             best, least = row if bound < least else best, bound if bound < least else least
         if least <= scratch.upper[m]:
@@ -109,7 +107,7 @@ def _others(needle, groups, m, group, low, waiting, scratch, answer):  # type: i
         waiting += 1
         if answer.square[low + m] == 0.0:  # it intersects the surface: only an earlier intersection counts now
             contact_from = _contact_from(scratch.chosen, group, lane, direction(scratch.frames32, m), needle.slack)
-            waiting -= 1 if contact_from > np.float32(answer.depth[low + m]) * GROWN else 0
+            waiting -= 1 if contact_from > np.float32(answer.depth[low + m]) * ROUNDED_UP else 0
     return waiting
 
 
@@ -122,8 +120,8 @@ def _contact_from(chosen, group, lane, u, slack):  # type: ignore[no-untyped-def
     center = (chosen[group, 0, lane], chosen[group, 1, lane], chosen[group, 2, lane])
     normal = (chosen[group, 3, lane], chosen[group, 4, lane], chosen[group, 5, lane])
     h, slope = chosen[group, 7, lane] + slack, _dot(normal, u)
-    enters = (_dot(center, normal) - (h if slope > ZERO else -h)) / slope if abs(slope) > SLOPE else ZERO
-    return max(_dot(center, u) - chosen[group, 8, lane] - slack, enters - FOUR * slack / SLOPE)
+    enters = (_dot(center, normal) - (h if slope > ZERO else -h)) / slope if abs(slope) > LEAST_SLOPE else ZERO
+    return max(_dot(center, u) - chosen[group, 8, lane] - slack, enters - OFFSET_SLACKS * slack / LEAST_SLOPE)
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -145,7 +143,7 @@ def _measure_pairs(surface, needle, low, waiting, lanes, scratch, answer, seed):
         count = np.int64(0)
         for p in range(waiting):
             m, first = scratch.pairs[p, 0], scratch.blocks[scratch.pairs[p, 1]] * LANES
-            reach = (scratch.upper[m] + scratch.errors[p]) * (scratch.upper[m] + scratch.errors[p]) * GROWN
+            reach = (scratch.upper[m] + scratch.errors[p]) * (scratch.upper[m] + scratch.errors[p]) * ROUNDED_UP
             limit = reach if iteration == 1 or reach < scratch.least[p] else scratch.least[p]
             bits = lanes_at_most(scratch.squares, p, limit)
             while bits != 0:
@@ -167,7 +165,7 @@ def _test_block(local, needle, low, p, lanes, scratch):  # type: ignore[no-untyp
     center = (scratch.chosen[group, 0, at], scratch.chosen[group, 1, at], scratch.chosen[group, 2, at])
     radius, x, y, along = scratch.chosen[group, 8, at], _dot(center, e), _dot(center, f), _dot(center, u)
     around = np.sqrt(x * x + y * y) + radius
-    tolerance = -around * (AREA_ROUNDING * around + THREE * slack)
+    tolerance = -around * (AREA_ROUNDING * around + AREA_SLACKS * slack)
     line_distances(local, block, e, f, x, y, tolerance, scratch.squares, p)
     length = np.float32(needle.length[low + m])
     if along + radius > length or along < radius:  # the block may reach beyond an end of the axis
@@ -197,5 +195,5 @@ def _try_all(triangles, needle, low, count, scratch, answer, seed):  # type: ign
         if square < answer.square[i] or (square == answer.square[i] and depth < answer.depth[i]):
             answer.square[i], answer.depth[i], seed = square, depth, scratch.tried[k, 1]
             answer.triangle[i] = seed
-            scratch.upper[m] = min(scratch.upper[m], np.float32(np.sqrt(square)) * GROWN)
+            scratch.upper[m] = min(scratch.upper[m], np.float32(np.sqrt(square)) * ROUNDED_UP)
     return seed

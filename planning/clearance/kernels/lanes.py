@@ -41,10 +41,8 @@ def _field_place(context: Any, kind: Any, name: str) -> int:
 
 LANES = 16
 """The float32 numbers of one AVX-512 register."""
-
 FAST = ("reassoc", "nsz", "contract", "arcp")
 """What LLVM may do with these sums; the slack of the bounds allows for it."""
-
 Number = float | np.floating[Any]
 
 FLOAT, INDEX = ir.FloatType(), ir.IntType(64)

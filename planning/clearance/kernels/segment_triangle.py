@@ -4,7 +4,6 @@ The axis starts at the origin and ends at ``length * u``. Every candidate below 
 non-negative weights of its corners, and its distance from the axis is computed from that point. So no candidate,
 however badly conditioned, can make the distance too small; and one of them is the nearest point (`axis_triangle`).
 
-`nearest_triangle` gives the target's own distance from a packed surface, an upper bound for every axis from there.
 `displaced_distance` measures axes displaced by little from the few faces near them; spheres around faces, and around
 blocks of 16, tell which faces may be skipped.
 """
@@ -20,8 +19,7 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES
 
 CONTACT_MM = 1e-10
 """Nearer than this the axis and the triangle intersect: a thousand times the rounding of coordinates of 500 mm."""
-
-LEAST = 1e-300
+LEAST_SQUARE_MM2 = 1e-300
 """Keeps a division by the square of an edge that is a point finite, mm^2."""
 
 
@@ -61,10 +59,10 @@ def axis_triangle(u, length, a, b, c):  # type: ignore[no-untyped-def]  # numba 
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _nearer(best, depth, found):  # type: ignore[no-untyped-def]  # numba infers
+def _nearer(best, depth, candidate):  # type: ignore[no-untyped-def]  # numba infers
     """The nearer of two candidates; of two that are equally near, that of lesser depth."""
-    if found[0] < best or (found[0] == best and found[1] < depth):
-        return found[0], found[1]
+    if candidate[0] < best or (candidate[0] == best and candidate[1] < depth):
+        return candidate[0], candidate[1]
     return best, depth
 
 
@@ -143,46 +141,6 @@ def _foot(qx, qy, qz, ax, ay, az, bx, by, bz, cx, cy, cz):  # type: ignore[no-un
     )
 
 
-STACK = 512
-"""Groups of nodes still to visit: at most 16 for each of a tree's levels, and 2^31 triangles have 8 levels."""
-
-
-@nb.njit(cache=True, error_model="numpy")
-def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-untyped-def]  # numba infers
-    """Distance of the target from a surface, mm, and the row of the nearest triangle: branch and bound over its tree.
-
-    Args:
-        target: Shape (3,), mm.
-        slack: Rounding of a node's coordinate, mm.
-    """
-    nearest, distance, waiting = 0, _distance(triangles, np.int64(0), target), 1
-    stack = np.empty((STACK, 2), np.int64)
-    stack[0, 0], stack[0, 1] = base[-1], len(base) - 1
-    while waiting > 0:
-        waiting -= 1
-        first, level = stack[waiting, 0], stack[waiting, 1]
-        for k in range(LANES):
-            reach = nodes[first, 9, k] - 2 * nodes[first, 8, k]  # (|c| + R) - 2 R: distance of the sphere
-            if reach - slack - 1e-5 * abs(reach) >= distance:
-                continue
-            child = (first - base[level]) * LANES + k
-            if level > 0:
-                stack[waiting, 0], stack[waiting, 1] = base[level - 1] + child, level - 1
-                waiting += 1
-                continue
-            for row in range(child * LANES, (child + 1) * LANES):
-                found = _distance(triangles, row, target)
-                nearest, distance = row if found < distance else nearest, min(found, distance)
-    return distance, nearest
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _distance(triangles, row, target):  # type: ignore[no-untyped-def]  # numba infers
-    t, (x, y, z) = triangles[row], (target[0], target[1], target[2])
-    a, b, c = (t[0] - x, t[1] - y, t[2] - z), (t[3] - x, t[4] - y, t[5] - z), (t[6] - x, t[7] - y, t[8] - z)
-    return np.sqrt(axis_triangle((0.0, 0.0, 1.0), 0.0, a, b, c)[0])
-
-
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def beyond(sphere, ox, oy, oz, ux, uy, uz, length, best):  # type: ignore[no-untyped-def]
     """Whether no point of a sphere (centre, radius) is nearer to the axis than ``best``."""
@@ -219,9 +177,9 @@ def displaced_distance(triangles, faces, blocks, origin, outward, length, enough
             continue
         for row in range(block * LANES, (block + 1) * LANES):
             if not beyond(faces[row], ox, oy, oz, ux, uy, uz, length, best):
-                found = _face(triangles, row, ox, oy, oz, outward, length)
-                if found < best:
-                    best, nearest = found, row
+                distance = _face(triangles, row, ox, oy, oz, outward, length)
+                if distance < best:
+                    best, nearest = distance, row
     return best, nearest
 
 
@@ -242,8 +200,10 @@ def displaced_distances(triangles, faces, blocks, origins, outward, length, dist
         distance[i], hint = displaced_distance(triangles, faces, blocks, origin, along, length, -1.0, hint)
 
 
-GROWN = 1 + 1e-9
-"""Factor by which a sphere's radius is grown, more than the rounding of its centre and radius."""
+LEAST_TILT = 1e-3
+"""Below, the reach grows nearly as fast as the axis goes on, and only its whole change bounds it (`blocks_near`)."""
+RADIUS_ROUNDED_UP = 1 + 1e-9
+"""Factor that raises a sphere's radius by more than the rounding of centre and radius."""
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -267,8 +227,8 @@ def blocks_near(center, disc, count, origin, outward, length, reach):  # type: i
         along = x * outward[0] + y * outward[1] + z * outward[2]
         across = math.sqrt(max(x * x + y * y + z * z - along * along, 0.0))
         # least of |c - s u| - reach(s) over the axis, which is convex in s
-        s = min(max(along + slope * across / max(tilt, 1e-3), 0.0), length)
-        bound = math.hypot(across, along - s) - slope * s if tilt > 1e-3 else -abs(slope) * length
+        s = min(max(along + slope * across / max(tilt, LEAST_TILT), 0.0), length)
+        bound = math.hypot(across, along - s) - slope * s if tilt > LEAST_TILT else -abs(slope) * length
         if bound - radius <= start:
             near[n_near], bounds[n_near] = block, bound - radius
             n_near += 1
@@ -297,4 +257,4 @@ def _sphere(points, sphere):  # type: ignore[no-untyped-def]
     for k in range(len(points)):
         dx, dy, dz = points[k, 0] - sphere[0], points[k, 1] - sphere[1], points[k, 2] - sphere[2]
         most = max(most, dx * dx + dy * dy + dz * dz)
-    sphere[3] = math.sqrt(most) * GROWN
+    sphere[3] = math.sqrt(most) * RADIUS_ROUNDED_UP

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST, axis_triangle
+from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST_SQUARE_MM2, axis_triangle
 
-ROWS = 12
+PAIR_ROWS = 12
 """Rows of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
-
 UNDECIDED, BEYOND = -1.0, -2.0
 """Marks in place of a squared distance: left to `axis_triangle`; the triangle lies wholly beyond the axis' top."""
 
@@ -86,7 +85,7 @@ def _shadow(px, py, tp, qx, qy, tq):  # type: ignore[no-untyped-def]  # numba in
     ``tp`` and ``tq`` are the depths of p and q.
     """
     dx, dy = qx - px, qy - py
-    t = -(px * dx + py * dy) / (dx * dx + dy * dy + LEAST)
+    t = -(px * dx + py * dy) / (dx * dx + dy * dy + LEAST_SQUARE_MM2)
     t = t if t > 0.0 else 0.0
     t = t if t < 1.0 else 1.0
     x, y = px + t * dx, py + t * dy
@@ -111,7 +110,7 @@ def _origin_triangle(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _origin_edge(p, q):  # type: ignore[no-untyped-def]  # numba infers
     d = _minus(q, p)
-    t = -_inner(p, d) / (_inner(d, d) + LEAST)
+    t = -_inner(p, d) / (_inner(d, d) + LEAST_SQUARE_MM2)
     t = min(max(t, 0.0), 1.0)
     x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     return x * x + y * y + z * z
@@ -134,43 +133,33 @@ def _cross(p, q):  # type: ignore[no-untyped-def]  # numba infers
 
 NODE_ROWS = 10
 """Of a group of nodes, see `bounds.disc_bounds`."""
-
 PAIRS = 64
 """Pairs of a direction and a block that are tested side by side."""
-
-APART = 8
+CACHE_PADDING = 8
 """Columns added to a row of ``corners``: rows of a power of two would all compete for the same cache lines."""
 
 
 class Scratch(NamedTuple):
     """Scratch arrays for one bundle of at most 16 directions."""
 
-    blocks: NDArray[np.int64]
-    """Shape (r,), the blocks that may come near to some member of the bundle."""
-    chosen: NDArray[np.float32]
-    """Shape (g, 10, 16), float32, the nodes of these blocks, in groups."""
+    blocks: NDArray[np.int64]  # shape (r,), the blocks that may come near to some member of the bundle
+    chosen: NDArray[np.float32]  # shape (g, 10, 16), float32, the nodes of these blocks, in groups
     bounds: NDArray[np.float32]
     """Shape (16 g, 16), float32, their bounds: of member m and group j in row m g' + j, g' groups being used."""
     stack: NDArray[np.int64]
     """Shape (512, 2), groups of the tree that are still to visit, and their level."""
     frames: NDArray[np.float64]
     """Shape (9, 16), each member's direction u, and e and f that complete it to a frame."""
-    frames32: NDArray[np.float32]
-    """``frames`` as float32."""
-    upper: NDArray[np.float32]
-    """Shape (16,), float32, upper bound of each member's distance, mm."""
-    pairs: NDArray[np.int64]
-    """Shape (64, 2), members, and rows of ``blocks``."""
+    frames32: NDArray[np.float32]  # ``frames`` as float32
+    upper: NDArray[np.float32]  # shape (16,), float32, upper bound of each member's distance, mm
+    pairs: NDArray[np.int64]  # shape (64, 2), members, and rows of ``blocks``
     squares: NDArray[np.float32]
     """Shape (64, 16), float32, squared distances of each pair's axis from its 16 triangles, mm^2."""
-    least: NDArray[np.float32]
-    """Shape (64,), float32, the least of each pair's ``squares``."""
+    least: NDArray[np.float32]  # shape (64,), float32, the least of each pair's ``squares``
     errors: NDArray[np.float32]
     """Shape (64,), float32, how much the root of a pair's ``squares`` may err, mm."""
-    tried: NDArray[np.int64]
-    """Shape (1024, 2), members, and rows of triangles."""
-    corners: NDArray[np.float64]
-    """Shape (12, 1032), see `measure_lateral`."""
+    tried: NDArray[np.int64]  # shape (1024, 2), members, and rows of triangles
+    corners: NDArray[np.float64]  # shape (12, 1032), see `measure_lateral`
 
 
 class SearchOutput(NamedTuple):
@@ -185,11 +174,7 @@ class SearchOutput(NamedTuple):
 class NeedleAxes(NamedTuple):
     """Start and length of the axes of a search."""
 
-    target: Any
-    """Three numbers, where all start, mm."""
-    length: Any
-    """Shape (n,), of each axis, in the bundles' order, mm."""
-    longest: Any
-    """Length of the longest axis of the bundle, float32, mm."""
-    slack: Any
-    """Rounding of a node's coordinate, float32, mm."""
+    target: Any  # three numbers, where all start, mm
+    length: Any  # shape (n,), of each axis, in the bundles' order, mm
+    longest: Any  # length of the longest axis of the bundle, float32, mm
+    slack: Any  # rounding of a node's coordinate, float32, mm

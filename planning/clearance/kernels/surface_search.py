@@ -10,22 +10,22 @@ import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.bounds import ZERO, disc_bounds, tighten_upper_bounds
-from puncture_twin.planning.clearance.kernels.bundle_search import FOUR, GROWN, direction, measure_bundle
+from puncture_twin.planning.clearance.kernels.bundle_search import OFFSET_SLACKS, ROUNDED_UP, direction, measure_bundle
 from puncture_twin.planning.clearance.kernels.lanes import LANES, bare, lanes_at_most, lowest_bit
-from puncture_twin.planning.clearance.kernels.segment_triangle import STACK
 from puncture_twin.planning.clearance.kernels.side_by_side import (
-    APART,
+    CACHE_PADDING,
     NODE_ROWS,
+    PAIR_ROWS,
     PAIRS,
-    ROWS,
     NeedleAxes,
     Scratch,
     SearchOutput,
 )
 
-BEHIND = np.float32(-1e6)
+FILLER_RADIUS_MM = np.float32(-1e6)
 """Radius of the lanes that only fill up the last group of blocks: `disc_bounds` takes them as behind the target, mm."""
-
+STACK = 512
+"""Groups of nodes still to visit: at most 16 for each of a tree's levels, and 2^31 triangles have 8 levels."""
 COUNTED = ("bundles", "nodes", "blocks found", "axes", "filters", "block tests", "triangle tests")
 """What `search_bundles` counts: how often it does each of its steps; a node and a filter are 16 discs."""
 
@@ -46,13 +46,13 @@ def scratch_for(groups: int) -> Scratch:
         least=np.empty(PAIRS, np.float32),
         errors=np.empty(PAIRS, np.float32),
         tried=np.empty((PAIRS * LANES, 2), np.int64),
-        corners=np.empty((ROWS, PAIRS * LANES + APART)),
+        corners=np.empty((PAIR_ROWS, PAIRS * LANES + CACHE_PADDING)),
     )
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
-    surface, all_nodes, slack, origin, lengths, at_target, nearest, bundles, scratch, found, lanes
+    surface, all_nodes, slack, origin, lengths, at_target, nearest, bundles, scratch, output, lanes
 ):
     """Find distance and depth of every axis from one structure.
 
@@ -64,12 +64,12 @@ def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
         at_target: Distance of the target itself from the surface, mm: an upper bound of every axis' distance.
         nearest: Row of the triangle that is nearest to the target.
         bundles: `Bundles.outward`, ``starts``, ``middle`` and ``chord``.
-        found: `SearchOutput`, written in the bundles' order; the counts are raised.
+        output: `SearchOutput`, written in the bundles' order; the counts are raised.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
     """
     triangles, local, base = bare(surface[0]), bare(surface[1]), bare(surface[2])
     outward, starts, middle, chords = bare(bundles[0]), bare(bundles[1]), bare(bundles[2]), bare(bundles[3])
-    nodes, work, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
+    nodes, work, answer = bare(all_nodes), _bare_scratch(scratch), _bare_output(output)  # the same arrays
     target, seed = (origin[0], origin[1], origin[2]), nearest
     length = bare(lengths)
     for bundle in range(len(middle)):
@@ -83,7 +83,9 @@ def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
         if seed != nearest:
             corners = _corners(triangles, seed, target)
             # The shortest axis is a part of every member's axis: a distance from it bounds theirs from above.
-            tighten_upper_bounds(work.frames32, lanes, corners, np.float32(shortest), FOUR * needle.slack, work.upper)
+            tighten_upper_bounds(
+                work.frames32, lanes, corners, np.float32(shortest), OFFSET_SLACKS * needle.slack, work.upper
+            )
         worst = ZERO
         for k in range(high - low):
             worst = max(worst, work.upper[k])
@@ -105,8 +107,8 @@ def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _bare_found(f):  # type: ignore[no-untyped-def]  # numba infers
-    return SearchOutput(bare(f.square), bare(f.depth), bare(f.triangle), bare(f.counts))
+def _bare_output(o):  # type: ignore[no-untyped-def]  # numba infers
+    return SearchOutput(bare(o.square), bare(o.depth), bare(o.triangle), bare(o.counts))
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -135,7 +137,7 @@ def _begin(outward, low, high, start, nearest, lanes, work, answer):  # type: ig
         work.frames[0, k], work.frames[1, k], work.frames[2, k] = u
         work.frames[3, k], work.frames[4, k], work.frames[5, k] = e
         work.frames[6, k], work.frames[7, k], work.frames[8, k] = f
-        work.upper[k] = np.float32(start) * GROWN
+        work.upper[k] = np.float32(start) * ROUNDED_UP
     for row in range(9):
         for k in range(lanes):
             work.frames32[row, k] = np.float32(work.frames[row, k])
@@ -188,4 +190,4 @@ def _gather(nodes, count, work):  # type: ignore[no-untyped-def]  # numba infers
             work.chosen[k // LANES, row, k % LANES] = nodes[group, row, lane]
     for k in range(count, (count + LANES - 1) // LANES * LANES):
         for row in range(NODE_ROWS):
-            work.chosen[k // LANES, row, k % LANES] = BEHIND if row == 8 else ZERO
+            work.chosen[k // LANES, row, k % LANES] = FILLER_RADIUS_MM if row == 8 else ZERO

@@ -22,23 +22,16 @@ from puncture_twin.planning.base.numba_kernels import allocation_free
 
 TOUCHING = -1e9
 """In place of a gap: a point that both hulls contain was found."""
-
 SUPPORTS = 30
 """Directions tried at most; it takes 3 to 8."""
-
 TIGHT = 0.9
 """Bounds that are as near to one another as this are not worth another direction."""
-
 ROUNDING_MM2 = 1e-16
 """Squared distance below which two points are one."""
-
 FLAT = 1e-10
 """Volume of a tetrahedron over that of its edges' box below which it has no inside."""
-
-
 FIRST, SECOND, THIRD = np.int64(0), np.int64(1), np.int64(2)
 """Of a simplex' corners; not plain numbers, see `numba_kernels`."""
-
 ONWARD = 1.0 - 1e-9
 """A step that brings the nearest points no nearer than by this fraction is the last."""
 
@@ -48,28 +41,18 @@ class Hulls(NamedTuple):
 
     axes: tuple[Floats, Floats, Floats]
     """The corners' x, y and z, each (n,) in one piece: so the outermost of many is found four abreast."""
-    starts: Ints
-    """Shape (h + 1,): where each hull's corners begin."""
-    few: tuple[Floats, Floats, Floats]
-    """x, y and z of some outer corners of each hull, as in ``axes``."""
+    starts: Ints  # shape (h + 1,): where each hull's corners begin
+    few: tuple[Floats, Floats, Floats]  # x, y and z of some outer corners of each hull, as in ``axes``
     few_starts: Ints
-    slack: Floats
-    """Shape (h,): no corner lies farther outside the hull of the few."""
-    corners: Floats
-    """Shape (n, 3): the corners once more."""
-    inner: Floats
-    """Shape (n, 3): corners within the body itself, where the hull only encloses it."""
-    rounded: NDArray[np.bool_]
-    """Shape (h,): where it does."""
-    neighbour_starts: Ints
-    """Shape (n + 1,): where each corner's neighbours begin."""
-    neighbours: Ints
-    """Their rows."""
-    centres: Floats
-    """Shape (h, 3): of a sphere about each hull."""
+    slack: Floats  # shape (h,): no corner lies farther outside the hull of the few
+    corners: Floats  # shape (n, 3): the corners once more
+    inner: Floats  # shape (n, 3): corners within the body itself, where the hull only encloses it
+    rounded: NDArray[np.bool_]  # shape (h,): where it does
+    neighbour_starts: Ints  # shape (n + 1,): where each corner's neighbours begin
+    neighbours: Ints  # their rows
+    centres: Floats  # shape (h, 3): of a sphere about each hull
     radii: Floats
-    frames: Ints
-    """Shape (h,): the frame that each moves with."""
+    frames: Ints  # shape (h,): the frame that each moves with
 
 
 @allocation_free()

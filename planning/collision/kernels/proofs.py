@@ -23,13 +23,10 @@ from puncture_twin.planning.collision.kernels.surfaces import STACK, moved, skin
 
 SKIN, BOX, PAIR = 0, 1, 2
 """Kinds of checks: body against skin, hull against a box of the workcell, hull against hull."""
-
 MIN_GAP_MM = 1e-3
 """What a gap must exceed to prove anything: far above the rounding of these sums (1e-10 mm) and FCL's tolerance."""
-
 ENOUGH_MM = 12.0
 """Gap from which on no tighter bound is sought along a path: the larger a gap, the later the check is due again."""
-
 FAR_MM = 200.0
 """Distance from the skin up to which a search is worth it: larger ones are reported as this."""
 
@@ -41,8 +38,7 @@ class SkinTree(NamedTuple):
     """Lowest and highest corners of its boxes and the triangles' corners: see :class:`TriangleTree`."""
     field: NDArray[np.float32]
     """Shape (i, j, k), mm: distances of the middles of cells; NaN where not computed yet."""
-    origin: Floats
-    """Shape (3,), mm: the lowest corner of the field."""
+    origin: Floats  # shape (3,), mm: the lowest corner of the field
     outside: NDArray[np.bool_]
     """Shape (leaves, k): which of the tree's triangles are no skin but what the CT shows besides."""
 
@@ -57,10 +53,8 @@ class ProofScene(NamedTuple):
     spheres: tuple[Floats, Floats, Ints]
     """Centres, radii and children of all bodies' trees of bounding spheres, each in the frame of its body."""
     hulls: Hulls
-    T_box_base: Floats
-    """Shape (h, 4, 4): by hull, where it is a box."""
-    halves: Floats
-    """Shape (h, 3), mm: the box's half sizes; -1 where it is none."""
+    T_box_base: Floats  # shape (h, 4, 4): by hull, where it is a box
+    halves: Floats  # shape (h, 3), mm: the box's half sizes; -1 where it is none
 
 
 class Movers(NamedTuple):
@@ -77,10 +71,8 @@ class ProofScratch(NamedTuple):
 
     axes: Floats
     """Shape (k, 3): each check's last separating direction, with which the next search begins; zero for none."""
-    corners: Ints
-    """Shape (k, 2): the corners of its last search."""
-    spheres: Floats
-    """Shape (h, 3), mm: where the centres of the hulls' spheres are."""
+    corners: Ints  # shape (k, 2): the corners of its last search
+    spheres: Floats  # shape (h, 3), mm: where the centres of the hulls' spheres are
     stack: Ints
     inner_stack: Ints
     M: Floats

@@ -268,14 +268,11 @@ def divide(scene, movers, segment, halvings, order, scratch, answered, answer):
 
 CLEAR, CONTACT, QUERY, NOT_FINITE = 0, 1, 2, 3
 """Results of a segment: proven but for the queries; a contact; a query to be made at once; joints not finite."""
-
 STATUS, CHECK, ANSWERED, QUERIES = 0, 1, 2, 3
 """The entries of an answer's status: one of the above; the check that touches; how many queries were, or are to be,
 answered at once; how many there are now."""
-
 HALVINGS = 6
 """Of a segment for all checks together; each check that is left goes on alone."""
-
 PARTS = 256
 """Space for parts of a segment that wait: one more for each halving, and 64 of them leave nothing of a segment."""
 
@@ -283,12 +280,9 @@ PARTS = 256
 class Answer(NamedTuple):
     """Result of a segment's check, filled by :func:`segments.check_segment`."""
 
-    status: Ints
-    """Shape (4,)."""
-    fractions: Floats
-    """Shape (q,): of each query, the fraction of the segment at which its state is."""
-    checks: Ints
-    """Shape (q,): the checks that are queried."""
+    status: Ints  # shape (4,)
+    fractions: Floats  # shape (q,): of each query, the fraction of the segment at which its state is
+    checks: Ints  # shape (q,): the checks that are queried
 
 
 class Segment(NamedTuple):
@@ -297,30 +291,21 @@ class Segment(NamedTuple):
     lengths: Floats
     start: Floats
     step: Floats
-    rotations: Floats
-    """Shape (6,), rad: how far each joint rotates."""
-    q: Floats
-    """Shape (1, 6): scratch."""
-    frames: Floats
-    """Shape (1, 7, 4, 4), mm: filled by :func:`place_arm`."""
+    rotations: Floats  # shape (6,), rad: how far each joint rotates
+    q: Floats  # shape (1, 6): scratch
+    frames: Floats  # shape (1, 7, 4, 4), mm: filled by :func:`place_arm`
 
 
 class SegmentScratch(NamedTuple):
     """Scratch in which a segment is checked: see :func:`segment_scratch`. Nothing in it outlasts the segment."""
 
     work: ProofScratch
-    kept: Floats
-    """Shape (k,), mm: what each check is to keep."""
-    lists: Ints
-    """Shape (2, n): lists of checks, those that are left before and after a halving."""
-    spans: Ints
-    """Shape (2, p, 2): where in them each part's begins and ends."""
-    paths: Floats
-    """Shape (m, 7), mm: of each mover, see :func:`paths_about`."""
-    known: Bools
-    """Shape (m,): of which movers."""
-    parts: Floats
-    """Shape (``PARTS``, 2): parts of a segment that wait."""
+    kept: Floats  # shape (k,), mm: what each check is to keep
+    lists: Ints  # shape (2, n): lists of checks, those that are left before and after a halving
+    spans: Ints  # shape (2, p, 2): where in them each part's begins and ends
+    paths: Floats  # shape (m, 7), mm: of each mover, see :func:`paths_about`
+    known: Bools  # shape (m,): of which movers
+    parts: Floats  # shape (``PARTS``, 2): parts of a segment that wait
 
 
 def segment_scratch(scene: ProofScene, movers: Movers) -> SegmentScratch:

@@ -23,11 +23,9 @@ from puncture_twin.planning.collision.kernels.proofs import MIN_GAP_MM, SKIN, ne
 CLEAR, OPEN, TOUCHES, TOUCHES_OUTSIDE = 0, 1, 2, 3
 """Results of a check: no contact; undecided, FCL is to be queried; a contact; a contact with what the CT shows outside
 of the patient, the skin being clear."""
-
 DEEP_MM = 1e-3
 """Overlap from which on two bodies certainly touch: far above the rounding of these sums (1e-10 mm) and FCL's
 tolerance. Between it and ``MIN_GAP_MM`` FCL decides."""
-
 SLIVER = 1e-6
 """Length of a triangle's cross product of edges over the sum of their squares, below which it is a sliver: its normal
 is mostly rounding. Above, rounding (1e-16 of those squares) moves the plane by 1e-9 of the edges at most, a thousandth
@@ -37,17 +35,14 @@ of ``MIN_GAP_MM`` for edges of a metre."""
 class Triangle(NamedTuple):
     """Scratch in which a triangle is one more hull: the corners of :class:`Hulls`, then the triangle's three."""
 
-    corners: Floats
-    """Shape (n + 3, 3), mm; the last three are filled in turn."""
+    corners: Floats  # shape (n + 3, 3), mm; the last three are filled in turn
     inner: Floats
     """Shape (n + 3, 3), mm: corners of the enclosed hulls, see :class:`Hulls`, and of the triangle."""
     starts: Ints
-    ends: Ints
-    """Of each corner the neighbours, see :class:`Hulls`."""
+    ends: Ints  # of each corner the neighbours, see :class:`Hulls`
     axis: Floats
     at: Ints
-    S: Floats
-    """Scratch, see :func:`distance_bounds`."""
+    S: Floats  # scratch, see :func:`distance_bounds`
     stack: Ints
 
 

@@ -15,14 +15,11 @@ from puncture_twin.planning.geometry.triangle_distance import to_triangle
 
 CELL_MM = 16.0
 """mm: edge of a cell in the field of distances to the skin."""
-
 HALF_CELL_MM = CELL_MM * math.sqrt(3.0) / 2.0 + 1e-3
 """No point of a cell is farther from its middle; the rounding of float32 included."""
-
 ROUGH = 0.9
 """The distance of a cell's middle from the skin is at least this fraction of the field's value. Far from a surface an
 exact search spends its time on many triangles that are equally near within less than a cell."""
-
 STACK = 64
 """Depth of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
 
@@ -114,17 +111,17 @@ def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
         node = stack[top]
         c, r = centres[node], radii[node]
         x, y, z = moved(T, c)
-        about, cutoff = _field_distance(tree, field, origin, x, y, z, inner_stack), best + r
-        if about >= 0.0:
-            at_least = ROUGH * about - HALF_CELL_MM - r  # lower bound of the sphere's distance, by the field
+        field_mm, cutoff = _field_distance(tree, field, origin, x, y, z, inner_stack), best + r
+        if field_mm >= 0.0:
+            at_least = ROUGH * field_mm - HALF_CELL_MM - r  # lower bound of the sphere's distance, by the field
             if at_least >= best:  # it cannot lower the result
                 continue
             if at_least > enough:
                 best = at_least
                 continue
-            if about + HALF_CELL_MM + r <= needed:  # no part of the body in this sphere is clear by as much
+            if field_mm + HALF_CELL_MM + r <= needed:  # no part of the body in this sphere is clear by as much
                 return 0.0
-            cutoff = min(cutoff, about + HALF_CELL_MM)
+            cutoff = min(cutoff, field_mm + HALF_CELL_MM)
         stop = max(0.0, needed + r)  # nearer than this the exact distance does not matter
         gap = to_surface(tree[0], tree[1], tree[2], x, y, z, cutoff, inner_stack, stop, 1.0) - r
         if gap >= best:

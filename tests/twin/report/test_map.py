@@ -43,8 +43,8 @@ def candidates(case):
 
 def with_clearance(found, mm):
     """The same directions, each with this least clearance."""
-    distance = np.full_like(found.clearance.distance, mm)
-    return replace(found, clearance=replace(found.clearance, distance=distance, least=distance.min(axis=1)))
+    distance = np.full_like(found.clearance.by_structure, mm)
+    return replace(found, clearance=replace(found.clearance, by_structure=distance, least=distance.min(axis=1)))
 
 
 def written(found, case):

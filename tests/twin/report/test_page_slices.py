@@ -124,5 +124,5 @@ def test_the_row_more_has_all_columns(case, candidates):
         np.degrees(apart.theta[5]), abs=1e-3
     )
     assert data["structures"][data["near"][-1][0]] == "rib_right_9" and data["near"][-1][1] == pytest.approx(
-        apart.clearance.distance[5, 0], abs=1e-3
+        apart.clearance.by_structure[5, 0], abs=1e-3
     )

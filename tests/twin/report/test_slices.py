@@ -212,8 +212,8 @@ def test_unknown_structures_are_beads_and_a_refused_direction_is_drawn_too():
 def test_the_legend_names_the_nearest_and_no_beads_that_are_not_there():
     """However far the nearest is; of beads it speaks where something is unknown."""
     one = subject()
-    one.pick.candidates.clearance.distance.setflags(write=True)
-    one.pick.candidates.clearance.distance[:] = [48.0, 55.0]
+    one.pick.candidates.clearance.by_structure.setflags(write=True)
+    one.pick.candidates.clearance.by_structure[:] = [48.0, 55.0]
     assert one.near == () and one.margin_mm == 0
     drawn = draw_slices(one)
     assert drawn.legend[-1][0] == "rib right 9: 48.0 mm, margin 1"

@@ -41,7 +41,8 @@ from puncture_twin.planning.arm.kinematics import (
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.state_checker import Contact, StateChecker
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, frame_yz, log_rotation, pose, rotated_about
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
@@ -274,7 +275,7 @@ class Posture(NamedTuple):
     branch: int
 
 
-def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
+def configurations(rod: CarriedRod, points_base: Floats, checker: CellChecker, *, first: int | None = None) -> Posture:
     """Joint angles that put the ball on every point (n, 3), mm, all on one branch, free of contacts.
 
     The branch ``first`` is tried first, then the one that stays farthest from every singularity; of equals, which
@@ -337,7 +338,7 @@ class Task:
     max_steps: int
     looks: int  # after so many a ball counts as lost
     limits: StepLimits
-    checker: StateChecker  # has the head where it is believed to be
+    checker: CellChecker  # has the head where it is believed to be
 
 
 class Visit(NamedTuple):
@@ -407,7 +408,7 @@ def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
         arm.move_jp(q_command)
 
 
-def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
+def path_contact(checker: CellChecker, q_path: Floats) -> Contact | None:
     """First contact along waypoints (m, 6), rad, checked as finely as any motion; None if free."""
     return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
 

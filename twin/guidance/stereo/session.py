@@ -24,7 +24,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import is_plain_file, read_input
-from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.formats.points import NamedPoints, joint_readings, read_points, write_points
 from puncture_twin.planning.formats.pose_table import parse_table, table_text
 from puncture_twin.planning.geometry.rigid import apply
@@ -89,7 +89,7 @@ class RobotCalibration:
     branch: int  # of the inverse kinematics, where its errors are known
 
 
-def calibration_commands(case: ServoCase, checker: StateChecker) -> Posture:
+def calibration_commands(case: ServoCase, checker: CellChecker) -> Posture:
     """Joints that put the ball on the calibration's points, along a path that touches nothing; without the head.
 
     Raises:

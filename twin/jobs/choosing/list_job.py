@@ -65,7 +65,7 @@ def check_list(
             rows.append(_document(row, Outcome(None, REFUSED, str(error))))
         context.watcher.count("rows", done, len(listed.rows))
     inputs, warnings = (listed.input, *context.case.inputs), (*listed.warnings, *context.anatomy.warnings)
-    checked = CheckedList(context.case.name, context.arm, inputs, tuple(rows), warnings)
+    checked = CheckedList(context.case.name, context.arm_note, inputs, tuple(rows), warnings)
     return checked if out is None else _written(checked, context, out)
 
 

@@ -199,7 +199,7 @@ class Planner:
             "case": self._context.case.name,
             "target_ras_mm": None if context is None else _ras(context.case.target_ct),
             "needle": None if session.needle is None else "known" if fault is None else fault.code,
-            "arm": self._context.arm,
+            "arm": self._context.arm_note,
             "structures": [one.name for one in self._context.anatomy.checked],
             "warnings": list(self._context.anatomy.warnings),
         }
@@ -268,7 +268,7 @@ def slack_mm(candidates: Candidates) -> float:
     where nothing demands a margin, NaN where it is not known.
     """
     clearance, breathing = candidates.clearance, candidates.breathing
-    found = np.nanmin(np.append(clearance.distance[0] - clearance.margins, np.inf))
+    found = np.nanmin(np.append(clearance.by_structure[0] - clearance.margins, np.inf))
     if breathing is not None:
         found = np.minimum(found, breathing.clearance[0] - np.nanmax(np.append(clearance.margins, 0.0)))
     return float(found if candidates.deflection is None else found - candidates.deflection[0])

@@ -214,7 +214,7 @@ class _Sheet(NamedTuple):
 def _written(run: Run, sheet: _Sheet, out: Path, csv: str, inputs: tuple[Input, ...], watcher: Watcher) -> Run:
     """A run with its files; Slicer knows no space of a case's own, and gets no list of it."""
     names, points, space = sheet.points.names, sheet.points.points, sheet.points.space or Space.LPS
-    markups = [] if space is Space.LOCAL else [csv.replace(".csv", MARKUPS)]
+    markups: list[str] = [] if space is Space.LOCAL else [csv.replace(".csv", MARKUPS)]
     files = (csv, *markups, PICTURE, REPORT)
     with writing(out, "markers", inputs=inputs, names=files, note=watcher.note) as draft:
         from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib

@@ -164,8 +164,8 @@ def _cards(shown: Shown) -> list[Card]:
         failed = Card("plan", "failed", refusal, bad=True)
         cards.append(failed if refusal else Card("plan", "not requested", patient.NOT_REQUESTED))
     if rehearsal is not None:
-        touched = len(rehearsal.contacts)
-        detail = plural(touched, "contact") if touched else "no contact"
+        contacts = len(rehearsal.contacts)
+        detail = plural(contacts, "contact") if contacts else "no contact"
         expected = f"expected (rms) {numbers.expected_text(rehearsal.predicted_error_mm)}; {detail}"
         if rehearsal.standing is not None:
             expected = f"{rehearsal.standing.text}; {expected}"

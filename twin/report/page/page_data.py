@@ -152,7 +152,7 @@ def _columns(
 def _near(found: Candidates, rows: Ints, index: dict[str, int]) -> list[list[float]]:
     """As `Subject.near`, of every row: place, mm, place, mm, and so on; at least the nearest, however far it is."""
     demanding = np.flatnonzero(np.isfinite(found.clearance.margins))
-    distance = found.clearance.distance[np.ix_(rows, demanding)]
+    distance = found.clearance.by_structure[np.ix_(rows, demanding)]
     order = np.argsort(distance, axis=1, kind="stable")[:, :MOST_NEAR]
     nearest = np.round(np.take_along_axis(distance, order, axis=1), 3)
     kept = np.isfinite(nearest) & ((nearest < NEAR_MM) | (np.arange(order.shape[1]) == 0))
@@ -238,8 +238,8 @@ def arm_data(scene: Scene) -> dict[str, Any] | None:
 
     Denavit and Hartenberg's lengths, where the base is, the joints of the scene's meshes, and those of each row, rad.
     """
-    first, T_base_ct, q = scene.q_target, scene.T_base_ct, scene.candidates.arm.q_insertion
-    if first is None or T_base_ct is None or (scene.plan is not None and not np.allclose(scene.base, T_base_ct)):
+    first, T_base_ct, plan, q = scene.q_target, scene.T_base_ct, scene.plan, scene.candidates.arm.q_insertion
+    if first is None or T_base_ct is None or (plan is not None and not np.allclose(plan.T_base_ct, T_base_ct)):
         return None
     rows = np.flatnonzero(np.isfinite(q).all(axis=1))
     return {

@@ -103,7 +103,7 @@ class Subject:
         if self.pick is None:
             return ()
         found, row = self.pick.candidates.clearance, self.pick.row
-        rows = zip(found.structures, found.distance[row].tolist(), found.margins.tolist(), strict=True)
+        rows = zip(found.structures, found.by_structure[row].tolist(), found.margins.tolist(), strict=True)
         near = (Near(name, self.colours.get(name, OUTSIDE), mm, margin) for name, mm, margin in rows)
         return tuple(sorted((one for one in near if np.isfinite(one.margin_mm)), key=lambda one: one.clearance_mm))
 
