@@ -30,6 +30,7 @@ written: [words](../words.md#how-texts-are-written).
 
 KINDS = {
     "refuse": "2",
+    "refusing": "2",
     "InputError": "2",
     "InputListError": "2",
     "NoAnswerError": "1",
@@ -39,7 +40,7 @@ KINDS = {
     "Finding": "",
 }
 SLOTS = ("what", "where", "allowed", "code")
-"""Of `refuse`, in order; the errors name what follows the first."""
+"""Of `refuse`, in order; the errors name what follows the first, and what `refusing` waits for comes before them."""
 FINDING_SLOTS = ("code", "severity", "what", "numbers", "allowed")
 SCHEMA_SLOTS = ("what", "code")
 FINDING_NAMES = {"sentence": "what", "way_out": "allowed"}
@@ -145,8 +146,8 @@ def assigned(name: str, nodes: list[ast.stmt], line: int) -> list[ast.expr]:
 def slots(call: ast.Call) -> dict[str, ast.expr]:
     """The parts of a refusal or a finding by their names."""
     kind = name_of(call)
-    order = FINDING_SLOTS if kind == "Finding" else SCHEMA_SLOTS if kind == "SchemaError" else SLOTS
-    given = dict(zip(order, call.args, strict=False))
+    orders = {"Finding": FINDING_SLOTS, "SchemaError": SCHEMA_SLOTS, "refusing": ("kinds", *SLOTS)}
+    given = dict(zip(orders.get(kind, SLOTS), call.args, strict=False))
     return given | {FINDING_NAMES.get(one.arg, one.arg): one.value for one in call.keywords if one.arg}
 
 
@@ -172,7 +173,8 @@ def rows_of(call: ast.Call, scope: Scope, room: str) -> Iterator[Row]:
     for code in dict.fromkeys(codes):
         for text in dict.fromkeys(texts(parts.get("what"), scope)):
             allowed = " / ".join(dict.fromkeys(texts(parts.get("allowed"), scope)))
-            yield Row(code, kind, room, text, allowed)
+            cause = f" ({VALUE})" if name_of(call) == "refusing" else ""
+            yield Row(code, kind, room, text + cause, allowed)
 
 
 def helper_rows(call: ast.Call, scope: Scope, room: str) -> Iterator[Row]:

@@ -53,8 +53,7 @@ def checked(function: Callable[Given, Found]) -> Callable[Given, Found]:
                 if not math.isfinite(value):
                     refuse(f"{name} is {float(value)}", function.__name__, "a finite number", "not_finite")
                 if not low <= float(value) <= high:
-                    allowed = f"{low:g} to {high:g}"
-                    refuse(f"{name} is {float(value):g}", function.__name__, allowed, "out_of_range")
+                    refuse(f"{name} is {float(value):g}", function.__name__, f"{low:g} to {high:g}", "out_of_range")
                 if not isinstance(value, bool | int):  # half precision counts no further
                     bound.arguments[name] = int(value) if isinstance(value, numbers.Integral) else float(value)
         return function(*bound.args, **bound.kwargs)

@@ -1,8 +1,6 @@
 """The exceptions of the planner: few, and each says what was wrong, where, and what is allowed.
 
-What a check of plausibility found: a code and numbers for a program, a sentence for a person.
-
-Parts of the installation that planner, map and page do without, and what is said where one is missing.
+Beside them what a check of plausibility found, and what is said where a part of the installation is missing.
 """
 
 from __future__ import annotations
@@ -10,7 +8,8 @@ from __future__ import annotations
 import copy
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib.util import find_spec
@@ -83,6 +82,17 @@ class InputError(PlanningError):
 def refuse(what: str, where: str | Path, allowed: str, code: str) -> NoReturn:
     """Raise an `InputError` of these parts: the usual way, where no other error is its cause."""
     raise InputError(what, where=where, allowed=allowed, code=code)
+
+
+@contextmanager
+def refusing(
+    kinds: type[Exception] | tuple[type[Exception], ...], what: str, where: str | Path, allowed: str, code: str
+) -> Iterator[None]:
+    """Refuse what raises one of these errors within: ``what``, and in brackets what the error says."""
+    try:
+        yield
+    except kinds as error:
+        raise InputError(f"{what} ({error})", where=where, allowed=allowed, code=code) from error
 
 
 class InputListError(InputError):
@@ -183,12 +193,8 @@ class Finding:
 
     def document(self) -> dict[str, object]:
         """The finding as it is listed under ``findings`` of ``--json``."""
-        return {
-            "code": self.code,
-            "severity": str(self.severity),
-            "numbers": dict(self.numbers),
-            "sentence": self.sentence,
-        }
+        measured = {"code": self.code, "severity": str(self.severity), "numbers": dict(self.numbers)}
+        return {**measured, "sentence": self.sentence}
 
 
 MODULES: Mapping[str, tuple[str, ...]] = MappingProxyType(

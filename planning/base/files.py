@@ -1,7 +1,4 @@
-"""Files: content hashes, and writing that leaves either the whole file or nothing.
-
-The bytes of an input file: it must be there, be a file, have a plausible size, and end a list with a whole line.
-"""
+"""Files: content hashes, writing that leaves the whole file or nothing, and the bytes of an input file."""
 
 from __future__ import annotations
 
@@ -12,33 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import InputError, refuse, refusing
 
 OUTPUT_NAMES = (
-    "manifest.json",
-    "timings.json",
-    "candidates.parquet",
-    "certificate.json",
-    "map.png",
-    "scene.png",
-    "slices.png",
-    "report.html",
-    "plan.json",
-    "rehearsal.json",
-    "rehearsal.mp4",
-    "batch.csv",
-    "placements.csv",
-    "place.json",
-    "placements.png",
-    "map_best_place.png",
-    "calibration.json",
-    "recording.csv",
-    "bmode.png",
-    "room.png",
-    "servo.html",
-    "convergence.png",
-    "camera_1.png",
-    "camera_2.png",
+    *("manifest.json", "timings.json", "candidates.parquet", "certificate.json", "map.png", "scene.png", "slices.png"),
+    *("report.html", "plan.json", "rehearsal.json", "rehearsal.mp4", "batch.csv", "placements.csv", "place.json"),
+    *("placements.png", "map_best_place.png", "calibration.json", "recording.csv", "bmode.png", "room.png"),
+    *("servo.html", "convergence.png", "camera_1.png", "camera_2.png"),
 )
 """The files that commands write into their output folder."""
 
@@ -97,14 +74,15 @@ def check_writable(folder: Path | str) -> Path:
     if not isinstance(folder, str | Path):
         refuse(f"a {type(folder).__name__} is no path", "output folder", allowed, "wrong_type")
     folder = Path(folder)
-    try:
+    with refusing((OSError, ValueError), "output folder cannot be used", _shown(folder), allowed, "unwritable"):
         if b"\0" in str(folder).encode("utf-8"):
             raise ValueError("embedded null byte")
         nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists() or place.is_symlink())
-        usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _names_fit(nearest, folder)
-    except (OSError, ValueError) as error:
-        what = f"output folder cannot be used ({error})"
-        raise InputError(what, where=_shown(folder), allowed=allowed, code="unwritable") from error
+        usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
+        if usable:  # and if every part of the name fits the file system, and no folder of a file's name is in the way
+            longest = os.pathconf(nearest, "PC_NAME_MAX")
+            usable = all(len(part.encode()) <= longest for part in folder.parts)
+            usable = usable and not any((folder / name).is_dir() for name in OUTPUT_NAMES)
     if not usable:
         refuse("output folder cannot be written to", _shown(folder), allowed, "unwritable")
     return folder
@@ -125,13 +103,6 @@ def new_folder(path: Path | None) -> Iterator[Path | None]:
         kept.replace(path)
 
 
-def _names_fit(nearest: Path, folder: Path) -> bool:
-    """Whether every part of the name fits the file system, and no folder of a file's name is in the way."""
-    longest = os.pathconf(nearest, "PC_NAME_MAX")
-    names = all(len(part.encode()) <= longest for part in folder.parts)
-    return names and not any((folder / name).is_dir() for name in OUTPUT_NAMES)
-
-
 def _shown(path: Path) -> str:
     return str(path).encode("utf-8", "replace").decode("utf-8")[:200]
 
@@ -139,20 +110,17 @@ def _shown(path: Path) -> str:
 def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> bytes:
     """All bytes of a file. Raises InputError: it is missing, no regular file, empty, too large, or not readable."""
     allowed = allowed or f"a readable file of 1 to {max_bytes} bytes"
-    try:
+    with refusing((OSError, ValueError), "cannot be read", where, allowed, "unreadable"):  # or a path with a NUL in it
         if not path.exists():
             other = _other_case(path)
-            refuse(
-                f"no such file; did you mean '{other}'?" if other else "no such file", where, allowed, "no_such_file"
-            )
+            what = f"no such file; did you mean '{other}'?" if other else "no such file"
+            refuse(what, where, allowed, "no_such_file")
         if not path.is_file():
             refuse("is a directory or device, not a file", where, allowed, "not_a_file")
         size = path.stat().st_size
         if not 0 < size <= max_bytes:
             refuse(f"has {size} bytes", where, allowed, "file_size")
         return path.read_bytes()
-    except (OSError, ValueError) as error:  # unreadable, or a path with a NUL in it
-        raise InputError(f"cannot be read ({error})", where=where, allowed=allowed, code="unreadable") from error
 
 
 def absence(path: Path) -> str:

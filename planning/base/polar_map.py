@@ -39,12 +39,9 @@ INK = 0.45
 class Sectors(NamedTuple):
     """n cells and what they are."""
 
-    theta: Floats
-    """Shape (n, 2), lowest and highest, rad."""
-    beta: Floats
-    """Shape (n, 2), lowest and highest, rad; from 0 on, at most a turn wide."""
-    code: Ints
-    """Shape (n,): row of the legend."""
+    theta: Floats  # shape (n, 2), lowest and highest, rad
+    beta: Floats  # shape (n, 2), lowest and highest, rad; from 0 on, at most a turn wide
+    code: Ints  # shape (n,): row of the legend
 
 
 class Entry(NamedTuple):
@@ -93,14 +90,12 @@ def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) 
         for row, entry in enumerate(legend)
         if (bins == row).any()
     )
-    said = (
-        f"θ from 0 in the middle to {np.degrees(rim):g}° at the rim, a circle every {RING_DEG:g}°; β from the right, up"
-    )
+    reach = f"θ from 0 in the middle to {np.degrees(rim):g}° at the rim, a circle every {RING_DEG:g}°"
     from PIL import Image  # here: only a notebook shows it
 
     stream = BytesIO()
     Image.fromarray(_drawn(bins, legend, rim)).save(stream, format="PNG")
-    return PolarMap(stream.getvalue(), f"<div>{said}</div>{lines}")
+    return PolarMap(stream.getvalue(), f"<div>{reach}; β from the right, up</div>{lines}")
 
 
 def _drawn(bins: Ints, legend: Sequence[Entry], rim: float) -> Pixels:

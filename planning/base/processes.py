@@ -1,7 +1,4 @@
-"""Work on processes of this machine, each of which starts anew: libraries with threads do not survive a fork.
-
-And on threads, where compiled code does it.
-"""
+"""Work on processes, each of which starts anew (libraries with threads do not survive a fork), and on threads."""
 
 from __future__ import annotations
 
@@ -63,8 +60,7 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
 def working(jobs: int, pieces: int) -> Iterator[Callable[..., Iterable[Any]]]:
     """What works as ``map`` does, in this process or in several; a function and its results must then be pickled.
 
-    Args:
-        jobs: Processes, at most one a core; 1 computes in this one, each piece when its result is taken.
+    ``jobs``: at most one a core; 1 computes in this process, each piece when its result is taken.
     """
     if worker_count(jobs, pieces) == 1:
         yield map

@@ -34,15 +34,12 @@ class Watcher(Protocol):
 
     def step(self, stage: str, what: str) -> None:
         """A stage has come to a named thing."""
-        ...
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
         """A stage has done so many of so many, and so many of these have failed."""
-        ...
 
     def note(self, line: str) -> None:
         """Something happened that whoever watches should know."""
-        ...
 
 
 class Silent:

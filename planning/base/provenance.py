@@ -39,11 +39,7 @@ def inputs_document(inputs: Iterable[Input]) -> list[dict[str, str]]:
 
 
 def read_inputs(document: Any) -> tuple[Input, ...]:
-    """The list of a result that was read from a file; TypeError, KeyError or ValueError for what is no such list.
-
-    Raises:
-        TypeError, KeyError, ValueError: It is no such list, or an input has two hashes in it.
-    """
+    """The list of a result that was read. Raises TypeError, KeyError, ValueError: no list, or one with two hashes."""
     if not isinstance(document, list):
         raise TypeError("inputs is not a list")
     inputs = tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
@@ -110,14 +106,9 @@ class InputFiles:
         self._inputs[role, ""] = content_input(role, "", content)
 
     def read(self, role: str, name: str, *, max_bytes: int, key: str, where: Path) -> bytes:
-        """The content of a file, which is read where no role has wanted it before.
+        """The content of a file, by its ``name`` in the ``key`` of ``where``; read where no role has wanted it before.
 
-        Args:
-            name: As ``where`` states it.
-            key: Of ``where``, for errors.
-
-        Raises:
-            InputError: It is missing, no plain file, empty, too large or not readable.
+        Raises InputError: it is missing, no plain file, empty, too large or not readable.
         """
         content = self._held.get(name)
         if content is None:

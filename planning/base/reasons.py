@@ -38,43 +38,24 @@ UNSEEN_AIR: Rgb = (190, 190, 196)
 """An unknown region outside of the body; one within it is darker, as `REASON_COLOURS` has it."""
 UNSEEN_AIR_TEXT = "unknown outside the body (image ends, or no air)"
 NOT_SEARCHED_TEXT = "outside the grid, not searched"
-REASON_COLOURS = MappingProxyType(
-    {
-        Reason.NO_SKIN_ENTRY: (221, 221, 221),
-        Reason.REENTERS_SKIN: (240, 228, 66),
-        Reason.TOO_LONG: (86, 180, 233),
-        Reason.SKIN_ANGLE: (230, 159, 0),
-        Reason.TOO_CLOSE: (213, 94, 0),
-        Reason.HIT_UNLIKELY: (153, 153, 51),
-        Reason.TOUCH_LIKELY: (204, 51, 17),
-        Reason.UNSAFE_WHEN_BREATHING: (102, 17, 0),
-        Reason.NEEDLE_BENDS: (170, 68, 153),
-        Reason.UNKNOWN_REGION: (110, 110, 110),
-        Reason.UNREACHABLE: (0, 90, 178),
-        Reason.ARM_COLLISION: (204, 121, 167),
-        Reason.INSERTION_BLOCKED: (136, 34, 85),
-        Reason.APPROACH_NOT_FOUND: (51, 34, 136),
-    }
-)
-REASON_TEXT = MappingProxyType(
-    {
-        Reason.NONE: "safe",
-        Reason.NO_SKIN_ENTRY: "no skin entry",
-        Reason.REENTERS_SKIN: "leaves and re-enters the skin",
-        Reason.TOO_LONG: "path longer than the needle's shaft",
-        Reason.SKIN_ANGLE: "too oblique at the skin",
-        Reason.TOO_CLOSE: "hits a structure or its margin",
-        Reason.HIT_UNLIKELY: "too unlikely to hit the target",
-        Reason.TOUCH_LIKELY: "too likely to touch a structure",
-        Reason.UNSAFE_WHEN_BREATHING: "unsafe at a phase of the breath",
-        Reason.NEEDLE_BENDS: "may bend into a structure's margin",
-        Reason.UNKNOWN_REGION: "unknown in the body (image ends, or not named)",
-        Reason.UNREACHABLE: "arm cannot reach the pose",
-        Reason.ARM_COLLISION: "arm would collide",
-        Reason.INSERTION_BLOCKED: "straight insertion not possible",
-        Reason.APPROACH_NOT_FOUND: "no approach found",
-    }
-)
+_SHOWN: dict[Reason, tuple[Rgb, str]] = {
+    Reason.NO_SKIN_ENTRY: ((221, 221, 221), "no skin entry"),
+    Reason.REENTERS_SKIN: ((240, 228, 66), "leaves and re-enters the skin"),
+    Reason.TOO_LONG: ((86, 180, 233), "path longer than the needle's shaft"),
+    Reason.SKIN_ANGLE: ((230, 159, 0), "too oblique at the skin"),
+    Reason.TOO_CLOSE: ((213, 94, 0), "hits a structure or its margin"),
+    Reason.HIT_UNLIKELY: ((153, 153, 51), "too unlikely to hit the target"),
+    Reason.TOUCH_LIKELY: ((204, 51, 17), "too likely to touch a structure"),
+    Reason.UNSAFE_WHEN_BREATHING: ((102, 17, 0), "unsafe at a phase of the breath"),
+    Reason.NEEDLE_BENDS: ((170, 68, 153), "may bend into a structure's margin"),
+    Reason.UNKNOWN_REGION: ((110, 110, 110), "unknown in the body (image ends, or not named)"),
+    Reason.UNREACHABLE: ((0, 90, 178), "arm cannot reach the pose"),
+    Reason.ARM_COLLISION: ((204, 121, 167), "arm would collide"),
+    Reason.INSERTION_BLOCKED: ((136, 34, 85), "straight insertion not possible"),
+    Reason.APPROACH_NOT_FOUND: ((51, 34, 136), "no approach found"),
+}
+REASON_COLOURS = MappingProxyType({reason: colour for reason, (colour, _) in _SHOWN.items()})
+REASON_TEXT = MappingProxyType({Reason.NONE: "safe"} | {reason: text for reason, (_, text) in _SHOWN.items()})
 
 
 def css(colour: Rgb) -> str:

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import InputError, refuse, refusing
 from puncture_twin.planning.base.files import read_input
 
 Value = TypeVar("Value")
@@ -33,11 +33,9 @@ def read_json(path: Path, *, max_bytes: int, allowed: str) -> Any:
 
 def parse_json(data: bytes, *, where: str | Path, allowed: str) -> Any:
     """The tree that bytes hold in UTF-8: each key once, each number finite, no endless nest. Raises InputError else."""
-    try:
+    with refusing((ValueError, RecursionError), "JSON cannot be read", where, allowed, "not_json"):
         text = data.decode("utf-8-sig")
         return json.loads(text, parse_constant=_refused, parse_float=_finite, object_pairs_hook=_unique_keys)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"JSON cannot be read ({error})", where=where, allowed=allowed, code="not_json") from error
 
 
 def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str) -> dict[str, Any]:
@@ -51,11 +49,7 @@ def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str
 
 @contextmanager
 def fitting(where: str | Path, allowed: str) -> Iterator[None]:
-    """Whatever a value of the wrong kind raises within (a missing key, another type, shape, size), as one line.
-
-    Raises:
-        InputError: A key that is missing, or a value of another type, shape or size.
-    """
+    """One InputError for a key that is missing within, or a value of another type, shape or size."""
     try:
         yield
     except KeyError as error:
@@ -107,11 +101,7 @@ def number_or_nan(value: Any) -> float:
 
 
 def array(value: Any, shape: tuple[int, ...]) -> Floats:
-    """Numbers within ±`MAX_NUMBER` of a known shape, read-only; ValueError for anything else.
-
-    Raises:
-        ValueError: Another shape, a larger number, or something else than numbers.
-    """
+    """Numbers within ±`MAX_NUMBER` of a known shape, read-only. Raises ValueError: another shape, or other values."""
     if not _numbers_only(value):
         raise ValueError("an array with values other than numbers")
     try:

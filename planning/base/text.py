@@ -1,10 +1,6 @@
-"""Names that come from files: what a terminal, a page and a table may be given.
+"""Names from files as a terminal, a page and a table may be given them, and the known one that was likely meant.
 
-One line for a value that holds arrays: what ``print`` and a prompt show.
-
-The known name that was likely meant by an unknown one: another capital, a letter too many, two letters swapped.
-
-How a value shows itself in a notebook: a small piece of HTML that needs nothing from outside, and never raises.
+How a value shows itself: one line for ``print`` and a prompt, a piece of HTML for a notebook; neither ever raises.
 """
 
 from __future__ import annotations
@@ -27,8 +23,7 @@ ALLOWED_NAME = f"printable characters on one line, {MAX_NAME} at most: no escape
 def check_name(name: str, what: str, *, where: str | Path) -> str:
     """Check a name that is printed as it is, and return it; ``what`` it names, as "label 3", is in the error.
 
-    Raises:
-        InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
+    Raises InputError: empty, of more than `MAX_NAME` characters, or with a control or format character.
     """
     if not name.strip():
         refuse(f"{what} has an empty name", where, ALLOWED_NAME, "bad_name")

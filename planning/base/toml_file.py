@@ -76,8 +76,7 @@ def parse_toml(
 ) -> Model:
     """Validate the bytes of such a file, after ``change`` stated some values otherwise; it is not opened again.
 
-    Raises:
-        InputError: Not TOML, or not of the schema: names the first key that is wrong.
+    Raises InputError: not TOML, or not of the schema: names the first key that is wrong.
     """
     try:
         text = content.decode("utf-8")

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, NoReturn
+from typing import Annotated, Any, NoReturn
 
 from pydantic import Field
 
@@ -26,9 +26,8 @@ from puncture_twin.planning.case.options import NO_OPTIONS, SECTIONS, CaseOption
 from puncture_twin.planning.case.tables import Section, Text
 
 CASE_FILE = "case.toml"
-
 ALLOWED = f"a folder with {CASE_FILE} files, a CSV with the header 'case', or a cohort.toml"
-
+READABLE = "readable folders of patients"
 MAX_FILE_BYTES = 200_000_000
 MOST_CASES = 1_000_000
 """A million lines of two hundred characters. More cases of one cohort are a slip in a grid of options."""
@@ -45,12 +44,9 @@ class CohortCase:
 
 
 def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]]:
-    """The cases of a cohort, in its order, and the file that lists them, if one does.
+    """The cases of a cohort (a folder, a ``.csv`` or ``.toml`` file), in its order, and the file that lists them.
 
-    Of a folder every ``case.toml`` below it; of a ``.csv`` or ``.toml`` file what it lists.
-
-    Raises:
-        InputError: Something else, a file that cannot be read whole, or no case at all.
+    Raises InputError: something else, a file that cannot be read whole, or no case at all.
     """
     inputs, readers = tuple[Input, ...](), {".csv": csv_cases, ".toml": toml_cases}
     if is_folder(cohort):
@@ -90,22 +86,16 @@ def _folder_cases(cohort: Path) -> list[CohortCase]:
             path = Path(folder) / CASE_FILE
             found.append(CohortCase(path.relative_to(cohort).as_posix(), path))
         elif below and (lost := [one for one in files if not (Path(folder) / one).exists()]):
-            _refuse(f"'{one_line(lost[0], 100)}' is a broken link", folder)
+            refuse(f"'{one_line(lost[0], 100)}' is a broken link", folder, READABLE, "cohort_not_whole")
     return sorted(found, key=lambda one: one.stated)
 
 
 def _refuse_unreadable(error: OSError) -> NoReturn:
-    _refuse(f"cannot be read ({error.strerror})", str(error.filename))
-
-
-def _refuse(what: str, where: str) -> NoReturn:
-    refuse(what, where, "readable folders of patients", "cohort_not_whole")
+    refuse(f"cannot be read ({error.strerror})", str(error.filename), READABLE, "cohort_not_whole")
 
 
 CASE, NAME, TARGET = "case", "name", "target"
-
 ALLOWED_COLUMNS = f"{CASE}, {NAME}, {TARGET}, and options as KIND.KEY (KIND one of {', '.join(SECTIONS)})"
-
 LONGEST_CELL = 20_000
 
 
@@ -178,20 +168,13 @@ def _value(cell: str) -> Any:
 
 
 ALLOWED_TOML = "a cohort.toml with cases = [patterns] and, if wanted, tables of options"
-
 KEYS = "docs/how-to/cohorts.md"
-
 Choices = dict[Text, dict[str, Any]] | tuple[Any, ...]
 """Options of one kind: by name, or as a list: texts are their own names, the rest is counted from 1."""
-
 AXES = {
-    "targets": "target",
-    "margins": "margins",
-    "mounts": "mount",
-    "needles": "needle",
-    "arms": "arm",
+    "targets": "target", "margins": "margins", "mounts": "mount", "needles": "needle", "arms": "arm",
     "errors": "errors",
-}
+}  # fmt: skip
 """Table of the cohort to the kind of its options."""
 
 
@@ -208,14 +191,6 @@ class CohortFile(Section):
     errors: Choices = ()
 
 
-class _Choice(NamedTuple):
-    """One option of an axis of the grid."""
-
-    name: str
-    kind: str
-    values: Mapping[str, Any]
-
-
 def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a cohort file describes: every match of its patterns with every combination of its options."""
     stated = parse_toml(content, path, CohortFile, allowed=ALLOWED_TOML, keys=KEYS)
@@ -226,8 +201,8 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
         refuse(f"gives {count} cases", path, f"at most {MOST_CASES}", "cohort_size")
     combinations = []
     for choices in product(*axes):
-        name = ", ".join(f"{one.kind} {one.name}" for one in choices)
-        options = case_options({one.kind: dict(one.values) for one in choices}, where=str(path))
+        name = ", ".join(f"{kind} {name}" for kind, name, _ in choices)
+        options = case_options({kind: dict(values) for kind, _, values in choices}, where=str(path))
         combinations.append((name, options))
     return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
 
@@ -243,12 +218,13 @@ def _matches(patterns: Sequence[str], path: Path) -> list[str]:
     return list(found)
 
 
-def _axis(stated: Any, axis: str, kind: str, path: Path) -> list[_Choice]:
+def _axis(stated: Any, axis: str, kind: str, path: Path) -> list[tuple[str, str, Mapping[str, Any]]]:
+    """Kind, name and values of each choice."""
     if isinstance(stated, Mapping):
         named = list(stated.items())
     else:
         named = [(one if isinstance(one, str) else str(number), one) for number, one in enumerate(stated, start=1)]
-    return [_Choice(name, kind, _table(values, kind, f"{path}: {axis}.{name}")) for name, values in named]
+    return [(kind, name, _table(values, kind, f"{path}: {axis}.{name}")) for name, values in named]
 
 
 def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:

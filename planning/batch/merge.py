@@ -26,7 +26,6 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 
 CASES_NAME, DATASET_NAME = "cases.parquet", "candidates"
-
 NOT_RUN = "not run"
 """The reason of a case that has no row yet; its exit code is null."""
 
@@ -82,7 +81,6 @@ def widened(table: pa.Table, schema: pa.Schema) -> pa.Table:
 
 NO_SAFE = "no safe direction"
 ENTRY = ("best_entry_x_mm", "best_entry_y_mm", "best_entry_z_mm")
-
 SCHEMA = pa.schema(
     [
         *((name, pa.string()) for name in ("case", "id", "name")),
@@ -116,7 +114,9 @@ def searched_row(planned: PlannedCase, context: CaseContext, candidates: Candida
     safe, counts = int(candidates.safe.sum()), candidates.counts()
     most = f" (most: {next(iter(counts))})" if counts else ""  # the reason of most directions, where none is safe
     row = blank_row(planned, 0 if safe else 1, None if safe else f"{NO_SAFE}{most}")
-    row |= {"directions": len(candidates), "safe": safe, "arm": context.arm_note, "reach_fraction": _reach(candidates)}
+    checked = candidates.arm.reachable >= 0  # of the organ-safe directions, where the arm was queried
+    reach = float((candidates.arm.reachable[checked] == 1).mean()) if checked.any() else None
+    row |= {"directions": len(candidates), "safe": safe, "arm": context.arm_note, "reach_fraction": reach}
     windows = candidates.windows
     row |= {"windows": len(windows), "safe_square_deg": sum(one.square_deg for one in windows)}
     row |= {"safe_entry_cm2": sum(one.entry_cm2 for one in windows)}
@@ -138,16 +138,9 @@ def _best(candidates: Candidates) -> dict[str, Any]:
     }
 
 
-def _reach(candidates: Candidates) -> float | None:
-    """Fraction of the organ-safe directions that the arm reaches; None where it was not queried."""
-    checked = candidates.arm.reachable >= 0
-    return float((candidates.arm.reachable[checked] == 1).mean()) if checked.any() else None
-
-
 MAX_TABLE_BYTES = 2_000_000_000
 ALLOWED = f"a cohort's folder after `batch merge`, or its {CASES_NAME}"
 NEEDED = ("case", "options", "exit_code", "reason", "safe", "best_clearance_mm", "best_theta_deg", "best_beta_deg")
-
 CaseKey = tuple[str, str, int]
 """Case as written, options, and which of several with both alike: what stays when inputs or versions change."""
 

@@ -26,15 +26,8 @@ import pyarrow.parquet as pq
 
 from puncture_twin.planning.base.errors import InputError, PlanningError, one_line, refuse
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.output.manifest import (
-    MANIFEST_NAME,
-    TIMINGS_NAME,
-    Manifest,
-    ManifestEntry,
-    file_digest,
-    problems,
-    read_output,
-)
+from puncture_twin.planning.base.output import manifest
+from puncture_twin.planning.base.output.manifest import Manifest, ManifestEntry, file_digest, problems, read_output
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input, inputs_document
 from puncture_twin.planning.base.strict_json import read_json
 from puncture_twin.planning.base.toml_file import find_toml, read_toml_bytes
@@ -44,7 +37,6 @@ from puncture_twin.planning.case.options import case_options
 
 PLAN_NAME, MAX_PLAN_BYTES, ID_DIGITS = "plan.parquet", 2_000_000_000, 32
 """Hexadecimal digits of an id: 128 bits, and too many digits for a number in any reader of partitions."""
-
 OWN_FOLDER = "the case's folder"
 NO_PLAN = "a folder written by `batch plan COHORT --out DIR`"
 
@@ -54,17 +46,13 @@ class PlannedCase:
     """A row of the plan."""
 
     case: str
-    id: str
-    """Hash of inputs, options and version; also the name of its result's folder."""
+    id: str  # hash of inputs, options and version; also the name of its result's folder
     name: str
     path: str
     options: str
-    arm: bool | None
-    """False leaves the arm out; None checks it where the case says where its base is."""
-    inputs: str
-    """Role, path and SHA-256 of each file, as JSON."""
-    refusal: str
-    """Why the case cannot be read, or ""."""
+    arm: bool | None  # False leaves the arm out; None checks it where the case says where its base is
+    inputs: str  # role, path and SHA-256 of each file, as JSON
+    refusal: str  # why the case cannot be read, or ""
 
 
 SCHEMA = pa.schema([(one.name, pa.bool_() if one.name == "arm" else pa.string()) for one in fields(PlannedCase)])
@@ -144,15 +132,11 @@ def read_plan_table(out: Path) -> Plan:
 ROW_NAME, TABLE_NAME, PAGE_NAME = "row.json", "candidates.parquet", "report.html"
 ENTRY = "batch"
 """Of a result's manifest."""
-
 MAX_ROW_BYTES = 1_000_000
-
 PROGRAM_FAILED = 3
 """The exit code of a case at which the program, not the case, failed: the next run tries it again."""
-
 IS_THERE = frozenset({errno.ENOTEMPTY, errno.EEXIST})
 """Error numbers of a rename where another result is there already."""
-
 WORK_PREFIX = ".puncture-twin-cases-"
 """Folders of results that are being written; who holds the lock of a part knows that nobody else writes to its own."""
 
@@ -165,17 +149,14 @@ def new_draft(work: Path, case_id: str) -> Path:
 def commit(draft: Path, out: Path, case_id: str, inputs: Sequence[Input], timings: Mapping[str, Any]) -> bool:
     """Put a draft in its place, with its manifest, by one rename; the second of two is discarded.
 
-    Args:
-        timings: What differs from run to run: seconds, attempts.
-
-    Returns:
-        Whether it is this draft that is there now.
+    ``timings`` differ from run to run: seconds, attempts. Returns whether it is this draft that is there now.
     """
     files = {path.name: file_digest(path) for path in sorted(draft.iterdir())}
-    manifest = Manifest({ENTRY: ManifestEntry(version("puncture-twin"), tuple(inputs), (), files)})
-    (draft / MANIFEST_NAME).write_text(manifest.text(), encoding="utf-8")
+    listed = Manifest({ENTRY: ManifestEntry(version("puncture-twin"), tuple(inputs), (), files)})
+    (draft / manifest.MANIFEST_NAME).write_text(listed.text(), encoding="utf-8")
     stated = {"started": datetime.now(UTC).isoformat(timespec="seconds"), **timings}
-    (draft / TIMINGS_NAME).write_text(json.dumps({ENTRY: stated}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    times = json.dumps({ENTRY: stated}, indent=1, allow_nan=False)
+    (draft / manifest.TIMINGS_NAME).write_text(times + "\n", encoding="utf-8")
     try:
         draft.chmod(0o755)
         draft.rename(out / case_id)

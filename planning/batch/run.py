@@ -1,11 +1,9 @@
 """Runs of a cohort: all of it or a part ``i/n``, on this machine or a scheduler's; its state, and an estimate.
 
-Cases are run by one process at a time until each has a row; what has one is left as it is.
-
-Dask runs a task again whose worker died, finished or not: every case is run at least once, and committed exactly once,
-because its result appears by a rename that only the first can make. The cohort, its output folder and this package are
-where every worker sees them under one path; a worker reads a patient's files itself, and keeps meshes and trees in
-memory by the hash of their bytes, so that no mesh travels with a case.
+Cases are run by one process at a time until each has a row; what has one is left as it is. Dask runs a task again whose
+worker died, finished or not: every case is run at least once, and committed exactly once, because its result appears by
+a rename that only the first can make. The cohort, its output folder and this package are where every worker sees them
+under one path; a worker reads a patient's files itself, and keeps meshes and trees in memory by their bytes.
 """
 
 from __future__ import annotations
@@ -32,21 +30,10 @@ from puncture_twin.planning.base.errors import InputError, one_line, refuse, req
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.base.progress import Count, Watcher
-from puncture_twin.planning.batch import plan as plans
-from puncture_twin.planning.batch.run_case import (
-    NO_LIMITS,
-    WORKER_DIED,
-    CaseEnd,
-    CaseTask,
-    Limits,
-    WritePage,
-    failed,
-    run_case,
-    run_tasks,
-)
+from puncture_twin.planning.batch import plan as plans, run_case as workers
+from puncture_twin.planning.batch.run_case import NO_LIMITS, CaseEnd, CaseTask, Limits, WritePage, run_case
 
 Item = TypeVar("Item")
-
 ALLOWED_PARTS = "i/n with 1 <= i <= n, such as 3/8"
 TASK, COUNT, FIRST, STEP = (f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "COUNT", "MIN", "STEP"))
 """What SLURM tells each task of an array: https://slurm.schedmd.com/job_array.html."""
@@ -97,7 +84,6 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
 
 RunTasks = Callable[[Sequence[CaseTask], Limits], Generator[CaseEnd, None, None]]
 """Runs cases somewhere, and yields how each ended."""
-
 LOCK_NAME = ".puncture-twin-run-lock"
 ALLOWED_AT_ONCE = "one run at a time, parallel parts (--part i/n), or another folder"
 
@@ -107,17 +93,12 @@ class RunCounts:
     """Counts of one run."""
 
     planned: int
-    same: int
-    """Planned cases that are others to the byte: they are run once."""
-    before: int
-    """Others that had their rows, of which ``refused_before`` were refused."""
+    same: int  # planned cases that are others to the byte: they are run once
+    before: int  # others that had their rows, of which ``refused_before`` were refused
     refused_before: int = 0
-    ended: Counter[int] = field(default_factory=Counter)
-    """Exit code of a row to how many rows."""
-    reasons: Counter[str] = field(default_factory=Counter)
-    """Of rows whose exit code is above 1."""
-    stale: int = 0
-    """Cases whose files are not those of the plan; they have no row."""
+    ended: Counter[int] = field(default_factory=Counter)  # exit code of a row to how many rows
+    reasons: Counter[str] = field(default_factory=Counter)  # of rows whose exit code is above 1
+    stale: int = 0  # cases whose files are not those of the plan; they have no row
 
     @property
     def failed(self) -> int:
@@ -175,7 +156,7 @@ def run_cohort(
         refused = sum(row["exit_code"] > 1 for row in cached if row is not None and plans.is_final(row))
         counts = RunCounts(len(rows), len(rows) - len(cases), len(cases) - len(tasks), refused)
         watcher.count("cases", 0, len(tasks))
-        run = elsewhere or partial(run_tasks, worker_count(jobs, len(tasks)))
+        run = elsewhere or partial(workers.run_tasks, worker_count(jobs, len(tasks)))
         with closing(run(tasks, limits)) as ends:
             for done, end in enumerate(ends, start=1):
                 if end.full:
@@ -195,8 +176,7 @@ def distinct(cases: Iterable[plans.PlannedCase]) -> list[plans.PlannedCase]:
 def running(out: Path, part: Part) -> Iterator[Path]:
     """Lock a part of a cohort, or refuse; yields a folder for drafts, which is removed in the end.
 
-    The system frees the locks of a process that dies, and its folder is removed by the next run of the same part, or of
-    the whole.
+    Of a process that dies the system frees the locks, and the next run of the part, or of the whole, the folder.
     """
     work = out / f"{plans.WORK_PREFIX}{part.number}-of-{part.parts}"
     with ExitStack() as stack:
@@ -253,9 +233,9 @@ class Estimate:
 def estimate(cases: Sequence[plans.PlannedCase]) -> Estimate:
     """Estimate a cohort from its first case that can be read, run twice, the second time warm."""
     readable = [one for one in cases if not one.refusal]
-    refused = len(cases) - len(readable)
+    count, refused = len(cases), len(cases) - len(readable)
     if not readable:
-        return Estimate(len(cases), refused)
+        return Estimate(count, refused)
     for _ in range(2):
         with tempfile.TemporaryDirectory() as folder:
             start = time.perf_counter()
@@ -263,7 +243,7 @@ def estimate(cases: Sequence[plans.PlannedCase]) -> Estimate:
             seconds = time.perf_counter() - start
             size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return Estimate(len(cases), refused, readable[0].case, seconds, COPIES * size * len(readable), peak)
+    return Estimate(count, refused, readable[0].case, seconds, COPIES * size * len(readable), peak)
 
 
 @dataclass
@@ -346,9 +326,8 @@ def on_scheduler(address: str) -> RunTasks:
         except (OSError, ValueError, TypeError) as error:
             what = f"no scheduler answers at this address ({one_line(str(error), 150)})"
             where = f"--scheduler {address[:80]}"
-            raise InputError(
-                what, where=where, allowed="tcp://HOST:PORT of a running scheduler", code="no_scheduler"
-            ) from error
+            allowed = "tcp://HOST:PORT of a running scheduler"
+            raise InputError(what, where=where, allowed=allowed, code="no_scheduler") from error
         with client:
             yield from _dask_ends(distributed, client, tasks)
 
@@ -368,7 +347,7 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
             if error is None:
                 yield future.result()
             elif isinstance(error, distributed.KilledWorker):
-                yield failed(task, WORKER_DIED)  # it killed its workers
+                yield workers.failed(task, workers.WORKER_DIED)  # it killed its workers
             else:
                 raise error
             future.release()

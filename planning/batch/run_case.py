@@ -1,10 +1,8 @@
-"""One case as a pure function, its files in, its result's folder out; and the worker that runs one after the other.
+"""One case as a pure function, its files in, its result's folder out; and the workers of this machine.
 
-Workers of this machine: one that dies is replaced, and the case it died of is tried once more.
-
-`concurrent.futures` and joblib give up the whole pool when one process dies; here a death costs one case one try. The
-memory of a worker is watched from outside (its resident set), not limited by the system's address space: compiled code
-and its threads reserve many times what they use.
+One that dies is replaced, and the case it died of is tried once more: `concurrent.futures` and joblib give up the whole
+pool. The memory of a worker is watched from outside (its resident set), not limited by the system's address space:
+compiled code and its threads reserve many times what they use.
 """
 
 from __future__ import annotations
@@ -40,9 +38,7 @@ from puncture_twin.planning.search.table import write_table
 
 WritePage = Callable[[CaseContext, Candidates, Path], None]
 """Writes a case's page into a folder."""
-
 BAD_INPUT = 2
-
 READY = "ready"
 """A worker's first message: its modules are loaded."""
 
@@ -62,11 +58,9 @@ class CaseEnd(NamedTuple):
     """How a case ended."""
 
     id: str
-    exit_code: int | None
-    """Of the case's row; None where there is no row, and ``reason`` says why."""
+    exit_code: int | None  # of the case's row; None where there is no row, and ``reason`` says why
     reason: str | None
-    full: str = ""
-    """What the system said of a disk that takes no more, or ""."""
+    full: str = ""  # what the system said of a disk that takes no more, or ""
 
 
 STALE = "its files differ from those of the plan"
@@ -114,8 +108,12 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
         if plans.case_id(planned.options, planned.arm, inputs, "") != planned.id:
             return CaseEnd(planned.id, None, STALE)
         row = _searched(task, context, draft)
-    except InputError as error:
-        return _refused(task, draft, plans.relative_text(str(error), planned))
+    except InputError as error:  # at reading it is the plan's own, or the files have changed; later, of its files
+        reason, now = plans.relative_text(str(error), planned), plans.identified(planned)
+        if now.id != planned.id:
+            return CaseEnd(planned.id, None, STALE)
+        row, inputs = blank_row(planned, BAD_INPUT, one_line(reason)), read_inputs(json.loads(now.inputs))
+        return _committed(task, draft, row, inputs, {})
     except Exception as error:  # whatever breaks becomes this case's row: the others go on
         if isinstance(error, OSError) and disk_is_full(error, task.out):
             raise
@@ -132,15 +130,6 @@ def _searched(task: CaseTask, context: CaseContext, draft: Path) -> dict[str, An
         task.write_page(context, candidates, draft)
         row["page"] = (draft / plans.PAGE_NAME).is_file()
     return row
-
-
-def _refused(task: CaseTask, draft: Path, reason: str) -> CaseEnd:
-    """A refusal at reading is the plan's own, or the files have changed; a later one is of the plan's files."""
-    now = plans.identified(task.planned)
-    if now.id != task.planned.id:
-        return CaseEnd(task.planned.id, None, STALE)
-    inputs = read_inputs(json.loads(now.inputs))
-    return _committed(task, draft, blank_row(task.planned, BAD_INPUT, one_line(reason)), inputs, {})
 
 
 def _committed(
@@ -183,10 +172,8 @@ def _leave_with_parent() -> None:
 
 WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memory"
 """Reasons of the rows that no worker could write."""
-
 TRIES, LOOK_EVERY_S = 2, 0.2
 """Tries of a case whose worker dies; and seconds between two checks of memory and time."""
-
 STATM = "/proc/{}/statm"
 SPAWN = multiprocessing.get_context("spawn")
 

@@ -1,7 +1,4 @@
-"""A case: a case file and all that it names, read once and validated; in LPS (or local) mm and radians.
-
-The bed frame: which way is up and which way lies the bed, as a case states it or as a patient usually lies.
-"""
+"""A case: a case file and all that it names, read once and validated; in LPS (or local) mm and radians. Its bed."""
 
 from __future__ import annotations
 
@@ -186,11 +183,8 @@ def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
 def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
 
-    Args:
-        options: What is stated in place of what the file states; they are an input of their own.
-
-    Raises:
-        InputError: Anything unreadable, unknown, missing or contradictory; names the key.
+    ``options`` are stated in place of what the file states, and an input of their own. Raises InputError: anything
+    unreadable, unknown, missing or contradictory; names the key.
     """
     path = find_toml(path, "case.toml")
     return _read(path, InputFiles(path.parent), options)
@@ -270,28 +264,20 @@ def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -
     assert target.points is not None  # held by the schema
     listed = parse_points(files.content(target.points), path.parent / target.points, default_space=space)
     if target.name not in listed.names:
-        names = ", ".join(listed.names)
         what = f"target.name '{target.name}' is not in {target.points}{did_you_mean(target.name, listed.names)}"
-        refuse(what, path, names, "unknown_point")
+        refuse(what, path, ", ".join(listed.names), "unknown_point")
     return read_only(listed.points[listed.names.index(target.name)].copy())
 
 
 Vector = tuple[float, float, float]
-
 UPRIGHT = 0.5
 """An entry frame whose z lies within 60 degrees of the body's long axis is not the direction up."""
 
 
 def bed_frame(case: Case) -> Floats:
-    """T_ct_bed: x along the bed (to the head), y across it (to the right of a patient on the back), z up; mm.
+    """T_ct_bed (4, 4), read-only, mm: x along the bed (to the head), y across (to the right of one on the back), z up.
 
-    ``place.up`` and ``place.along`` say both, see `up_axis` and `along_axis`.
-
-    Returns:
-        Shape (4, 4), read-only.
-
-    Raises:
-        InputError: The two are parallel.
+    See `up_axis` and `along_axis`. Raises InputError: the two are parallel.
     """
     R_ct_bed = settings.axes_frame(up_axis(case), along_axis(case), Space.LPS, case.path, "place: up and along")
     return view_frame(R_ct_bed, case.target_ct)

@@ -8,7 +8,8 @@ at the top, before the first table, where it tells lost structures but nothing t
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated, Any, Literal, Self, get_args
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, Strict, model_validator
 
@@ -19,7 +20,6 @@ from puncture_twin.planning.case.tables import CaseName, Section, Text
 
 COUNT_KEY = "structures = N"
 """The name under which the count at the top reaches the model: TOML knows ``structures`` as an array of tables too."""
-
 Region = Literal["abdomen", "chest", "pelvis", "brain", "head", "neck", "spine", "limb", "phantom", "other"]
 """Which part of the body, or of what else, a case shows."""
 
@@ -86,11 +86,7 @@ class CaseFile(Section):
 
     @property
     def stated_structures(self) -> int:
-        """How many structures the file says that it has, the skin among them.
-
-        Raises:
-            ValueError: It does not say, or says two numbers.
-        """
+        """How many structures the file says that it has, with the skin. Raises SchemaError: none, or two."""
         at_top, at_end = self.structure_count, None if self.end is None else self.end.structures
         stated = at_top if at_end is None else at_end
         if stated is None:
@@ -119,53 +115,49 @@ class CaseFile(Section):
             data = {**{key: value for key, value in data.items() if key != "structures"}, COUNT_KEY: count}
         return {"schema": None, "region": None, **data}
 
-    @model_validator(mode="after")
-    def _no_contradiction(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         stated = self.stated_structures
-        wrong = "" if self.structures else count_difference(stated, len(self.structure))
-        if wrong:
-            raise SchemaError(wrong, "structures_miscounted")
+        if wrong := "" if self.structures else count_difference(stated, len(self.structure)):
+            yield SchemaError(wrong, "structures_miscounted")
         if self.registration is not None and self.robot.mount is not None:
-            raise SchemaError("[registration] and [robot.mount] both place the base; keep one", "stated_twice")
+            yield SchemaError("[registration] and [robot.mount] both place the base; keep one", "stated_twice")
         if self.errors is None and self.rehearsal.errors is not None:
-            what = "[rehearsal.errors] differs from [errors], and [errors] is missing"
-            raise SchemaError(what, "missing_errors")
+            yield SchemaError("[rehearsal.errors] differs from [errors], and [errors] is missing", "missing_errors")
         if self.errors is None and self.registration is not None and self.registration.correct:
             what = "registration.correct needs [errors]: it estimates the arm's errors from the declared ones"
-            raise SchemaError(what, "missing_errors")
+            yield SchemaError(what, "missing_errors")
         chances = (self.search.min_hit, self.search.max_touch, self.search.max_touch_of or None)
         if self.errors is None and any(chance is not None for chance in chances):
             what = "search.min_hit and max_touch need [errors]: without declared errors there are no chances"
-            raise SchemaError(what, "missing_errors")
+            yield SchemaError(what, "missing_errors")
         if self.stereo is not None and self.stereo.balls_mm[-1] >= self.needle.length_mm:
             far, length = self.stereo.balls_mm[-1], self.needle.length_mm
             what = f"stereo.balls_mm: {far:g} is not on the needle, whose length_mm is {length:g}"
-            raise SchemaError(what, "out_of_range")
+            yield SchemaError(what, "out_of_range")
         if self.space == "local" and self.registration is not None and self.registration.transform is not None:
             what = 'registration.transform: a transform file is in patient space; space "local" has none'
-            raise SchemaError(what, "local_space")
+            yield SchemaError(what, "local_space")
         if self.space == "local" and self.ct.file is not None:
-            raise SchemaError('ct.file: a CT is in patient space; space "local" has none', "local_space")
+            yield SchemaError('ct.file: a CT is in patient space; space "local" has none', "local_space")
         if self.space == "local" and any(s.cut for s in self.structure):
-            raise SchemaError('cut names sides of a patient; space "local" has none', "local_space")
+            yield SchemaError('cut names sides of a patient; space "local" has none', "local_space")
         if self.space == "local" and self.search.frame not in {None, "ct"}:
-            raise SchemaError('search.frame must be "ct" for space "local": it has no head and no front', "local_space")
+            yield SchemaError('search.frame must be "ct" for space "local": it has no head and no front', "local_space")
         for name, count in Counter(s.name for s in self.structure).items():
             if count > 1:
-                raise SchemaError(f"structure '{name}' appears twice; names are unique", "duplicate_name")
+                yield SchemaError(f"structure '{name}' appears twice; names are unique", "duplicate_name")
         skins = [s.name for s in self.structure if s.role == "skin"]
         if len(skins) != 1:
-            raise SchemaError(f'exactly one structure must have role "skin"; here {skins or "none"}', "not_one_skin")
+            yield SchemaError(f'exactly one structure must have role "skin"; here {skins or "none"}', "not_one_skin")
         if self.space != "local":
-            return self
+            return
         gantry = self.gantry
         if gantry is not None and not (isinstance(gantry.axis, tuple) and isinstance(gantry.up, tuple)):
             what = 'gantry: space "local" has no head and no front; give axis and up as vectors'
-            raise SchemaError(what, "local_space")
+            yield SchemaError(what, "local_space")
         if isinstance(self.place.up, str) or isinstance(self.place.along, str):
             what = 'place: space "local" has no head and no front; give up and along as vectors'
-            raise SchemaError(what, "local_space")
-        return self
+            yield SchemaError(what, "local_space")
 
 
 def case_schema() -> dict[str, Any]:

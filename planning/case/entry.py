@@ -17,21 +17,14 @@ from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.rigid import frame_of_axes
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
-ANATOMICAL_LPS = MappingProxyType(
-    {
-        "left": (1.0, 0.0, 0.0),
-        "right": (-1.0, 0.0, 0.0),
-        "posterior": (0.0, 1.0, 0.0),
-        "anterior": (0.0, -1.0, 0.0),
-        "head": (0.0, 0.0, 1.0),
-        "feet": (0.0, 0.0, -1.0),
-    }
-)
+ANATOMICAL_LPS = MappingProxyType({
+    "left": (1.0, 0.0, 0.0), "right": (-1.0, 0.0, 0.0),
+    "posterior": (0.0, 1.0, 0.0), "anterior": (0.0, -1.0, 0.0),
+    "head": (0.0, 0.0, 1.0), "feet": (0.0, 0.0, -1.0),
+})  # fmt: skip
 """Unit vectors of the body's directions in LPS."""
-
 AXES_PARALLEL = 0.999
 """|cos| above which two axes do not span a frame (2.6 degrees)."""
-
 GRID_SLACK, SAME_ANGLE = 1e-9, 1e-9
 """Fraction of a step by which rounding may miss the end of a range; and radians within which θ is at a pole."""
 
@@ -42,10 +35,8 @@ class Directions:
 
     theta: Floats  # shape (n,), puncture angle from the entry frame's +z, rad
     beta: Floats  # shape (n,), azimuth from +x in its xy plane, rad
-    outward_ct: Floats
-    """Shape (n, 3), unit vectors in the CT frame, from the target outward."""
-    grid: AngleGrid | None = None
-    """The regular grid that they are, row by row; None for any others."""
+    outward_ct: Floats  # shape (n, 3), unit vectors in the CT frame, from the target outward
+    grid: AngleGrid | None = None  # the regular grid that they are, row by row; None for any others
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -127,11 +118,8 @@ def direction(theta: Floats | float, beta: Floats | float, R_ct_entry: Floats) -
 def grid(theta: tuple[float, float], beta: tuple[float, float], step: float, R_ct_entry: Floats) -> Directions:
     """Every (θ, β) of a regular grid, θ outermost; β = 360° is left out where the range is the full circle.
 
-    Args:
-        theta: Lowest and highest puncture angle, rad; both belong to the grid where the step meets them.
-        beta: Lowest and highest azimuth, rad.
-        step: Grid step of both angles, rad.
-        R_ct_entry: Rotation of the entry frame, shape (3, 3).
+    Of the lowest and highest angles and their step, rad: ends belong to the grid where the step meets them; and the
+    rotation of the entry frame, shape (3, 3).
     """
     azimuths = _steps(beta, step)
     full_circle = bool(len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK)
@@ -193,9 +181,5 @@ class AngleGrid:
         beyond = [self.theta[0] > SAME_ANGLE, self.theta[-1] < np.pi - SAME_ANGLE]
         beside = none if self.full_circle else np.array([self.beta[0] - self.step, self.beta[-1] + self.step])
         rows = (np.array(polar)[beyond], self.beta), (self.theta, beside)
-        theta, beta = np.concatenate([_product(one, other) for one, other in rows], axis=1)
-        return np.clip(theta, 0.0, np.pi), beta
-
-
-def _product(theta: Floats, beta: Floats) -> Floats:
-    return np.stack([np.repeat(theta, len(beta)), np.tile(beta, len(theta))])
+        theta = np.concatenate([np.repeat(one, len(other)) for one, other in rows])
+        return np.clip(theta, 0.0, np.pi), np.concatenate([np.tile(other, len(one)) for one, other in rows])

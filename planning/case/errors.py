@@ -26,10 +26,8 @@ from puncture_twin.planning.geometry.spaces import Space
 DEFAULT_READING_MM, DEFAULT_TOUCH_MM, DEFAULT_DRIFT_DEG = 0.5, 0.35, 0.02
 """Of a marker in a CT whose pixel and slice spacing nobody stated; what the touches of Chen 2019 show without any CT
 (distances between its markers, measured twice); of every joint between touch and insertion."""
-
 UNIFORM = 1.0 / np.sqrt(12.0)
 """Standard deviation of an error that is uniform over one cell, over the cell."""
-
 THICK_MM, SIDEWAYS = 3.0, 0.5
 """Slices up to this let a contour err by its own cell alone, in every direction. Of what slices exceed that by: between
 them a contour that leans is a stair, which errs sideways too. Balls of 8 mm and more, averaged over slices of up to
@@ -94,22 +92,14 @@ class ArmErrors(Section):
 class ArmUncertainty:
     """Standard deviations of an arm and the needle on it; mm and radians."""
 
-    link_mm: float
-    """Of every Denavit-Hartenberg length a_i and d_i."""
-    twist: float
-    """Of every twist alpha_i."""
-    joint: float
-    """Of every joint's zero."""
-    repeatability: float
-    """Of every joint, anew at each arrival."""
-    drift: float
-    """Of every joint, since the markers were touched."""
-    tip_offset_mm: float
-    """Of the needle's tip, per axis of the flange."""
-    needle_direction: float
-    """Of the needle's direction, about each of the flange's x and y axes."""
-    jitter: float = 0.0
-    """Of every joint about where it arrived, at any one moment; a touch reads its mean."""
+    link_mm: float  # of every Denavit-Hartenberg length a_i and d_i
+    twist: float  # of every twist alpha_i
+    joint: float  # of every joint's zero
+    repeatability: float  # of every joint, anew at each arrival
+    drift: float  # of every joint, since the markers were touched
+    tip_offset_mm: float  # of the needle's tip, per axis of the flange
+    needle_direction: float  # of the needle's direction, about each of the flange's x and y axes
+    jitter: float = 0.0  # of every joint about where it arrived, at any one moment; a touch reads its mean
 
     @property
     def arriving(self) -> float:

@@ -1,8 +1,6 @@
-"""The files that a case names: each with its role, the key that names it, and how large it may be.
+"""The files that a case names, each with its role, key and largest size; its volumes, each read once with its files.
 
-The volumes that a case names: each is read once with all of its files, and kept as the source that they make.
-
-What a case leaves open: whether it and the lists that it names are whole, by their ends, and where its robot is.
+And what a case leaves open: whether it and its lists are whole, by their ends, and where its robot is.
 """
 
 from __future__ import annotations
@@ -21,13 +19,8 @@ from puncture_twin.planning.case.settings import RobotSettings
 from puncture_twin.planning.case.tables import StructuresSection
 from puncture_twin.planning.formats import itk_transform, points
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file, is_series
-from puncture_twin.planning.formats.labels import naming
-from puncture_twin.planning.formats.labels.label_sources import (
-    SEGMENT_ENDING,
-    mask_files,
-    parse_segments,
-    structure_name,
-)
+from puncture_twin.planning.formats.labels import label_sources, naming
+from puncture_twin.planning.formats.labels.label_sources import mask_files, structure_name
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.volumes import volume_files as volumes
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, VolumeFile, VolumeSource, data_file
@@ -35,7 +28,6 @@ from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, 
 if TYPE_CHECKING:
     from puncture_twin.planning.formats.dicom.ct_series import CtSeries
     from puncture_twin.planning.formats.dicom.named_masks import NamedMasks
-
 
 MASK_ROLE = "mask "
 """How the role of a mask begins; its structure's name follows."""
@@ -51,14 +43,9 @@ class NamedFile(NamedTuple):
 
 
 def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> tuple[str, ...]:
-    """Read and hash whatever the case names, each file once; what costs little first.
+    """Read and hash whatever the case names, each file once, what costs little first; what is left open, in sentences.
 
-    Returns:
-        What is left open about being whole, one sentence each.
-
-    Raises:
-        InputError: A file that is missing, too large or not what its key says, or a list that was cut; what lies among
-            masks and is not read.
+    Raises InputError: a file is missing, too large, another than its key says, or cut; or one among masks is not read.
     """
     single = list(named_files(content))
     masks = list(_masks(content, path, single))
@@ -77,9 +64,8 @@ def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volu
 def named_files(content: CaseFile) -> Iterator[NamedFile]:
     """Every file that a case names, and folders with a CT, in the order of its sections; of folders of masks none."""
     most = volumes.MAX_FILE_BYTES
-    rows: list[tuple[str, str | None, str, int]] = [
-        ("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
-    ]
+    rows = list[tuple[str, str | None, str, int]]()
+    rows.append(("target", content.target.points, "target.points", points.MAX_FILE_BYTES))
     for one in content.structure:
         key = f"structure '{one.name}'"
         rows.append((f"mesh {one.name}", one.mesh, key, meshes.MAX_FILE_BYTES))
@@ -130,21 +116,25 @@ class CaseVolumes:
     """The CT and the label maps of a case, by names relative to the folder of its file."""
 
     def __init__(self, files: InputFiles, path: Path) -> None:
-        self._files = files
-        self._path = path
+        self._files, self._path = files, path
         self._sources: dict[str, VolumeSource] = {}
         self._series: dict[str, CtSeries] = {}
         self._masks: dict[str, NamedMasks] = {}
 
     def read(self, role: str, name: str, *, key: str) -> None:
-        """Read every file of a volume; those that hold its voxels decide as much as its header.
-
-        Raises:
-            InputError: A file that is missing, too large or not readable, or a header that is damaged.
-        """
+        """Read every file of a volume: those with its voxels decide too. Raises InputError: unreadable, or damaged."""
         path = self._path.parent / name
         if role == "ct" and is_series(path):
-            self._sources[name] = self._series[name] = self._read_series(path, name, key)
+            from puncture_twin.planning.formats.dicom.ct_series import parse_series
+            from puncture_twin.planning.formats.dicom.recognise import choose_series
+
+            chosen = choose_series(path)  # a folder of slices, or the series of one: every slice decides
+            folder = PurePosixPath(name) if chosen.folder == path else PurePosixPath(name).parent
+            files = [str(folder / file) for file in chosen.names]
+            for file in files:
+                self._files.read("ct", file, max_bytes=MAX_FILE_BYTES, key=key, where=self._path)
+            series = parse_series(path, files, self._files.content, chosen.notes)
+            self._sources[name] = self._series[name] = series
             return
         content = self._files.read(role, name, max_bytes=MAX_FILE_BYTES, key=key, where=self._path)
         beside = data_file(content, path)
@@ -162,19 +152,23 @@ class CaseVolumes:
         return self._series.get(name or "")
 
     def read_masks(self, section: StructuresSection, case_ct: str | None) -> None:
-        """The structures of a SEG (DICOM, or Slicer's .seg.nrrd) or RTSTRUCT whose file has been read; else none.
+        """Read the structures of a SEG (DICOM, or Slicer's .seg.nrrd) or RTSTRUCT; without one, none.
 
         They were drawn on the CT series that the section names, or on the case's.
-
-        Raises:
-            InputError: Structures that cannot be trusted, or that were drawn in other coordinates.
+        Raises InputError: they cannot be trusted, or were drawn in other coordinates.
         """
         name = section.seg or section.rtstruct
         if name is None:
             return
-        if section.seg is not None and name.lower().endswith(SEGMENT_ENDING):
-            self._add_masks(name, parse_segments(self._path.parent / name, name, self._files.content))
-            return
+        if section.seg is not None and name.lower().endswith(label_sources.SEGMENT_ENDING):
+            found = label_sources.parse_segments(self._path.parent / name, name, self._files.content)
+        else:
+            found = self._drawn(section, name, case_ct)
+        self._masks[name] = found
+        self._sources |= {_key(name, called): mask for called, mask in found.masks.items()}
+
+    def _drawn(self, section: StructuresSection, name: str, case_ct: str | None) -> NamedMasks:
+        """The structures of a DICOM file."""
         from puncture_twin.planning.formats.dicom.named_masks import check_frame_of_reference
         from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
         from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
@@ -184,17 +178,11 @@ class CaseVolumes:
         if series is not None and shown is not None:
             check_frame_of_reference(series.frame_of_reference, shown, series.path)
         if section.rtstruct is None:
-            found = parse_segmentation(path, name, self._files.content, series)
-        elif series is None:
+            return parse_segmentation(path, name, self._files.content, series)
+        if series is None:
             what = f"rtstruct '{name}' needs the CT on which it was drawn, as a DICOM series"
             refuse(what, self._path, 'ct = "FOLDER" next to it, or as the CT of the case', "rtstruct_without_ct")
-        else:
-            found = parse_structure_set(path, name, self._files.content, series)
-        self._add_masks(name, found)
-
-    def _add_masks(self, name: str, found: NamedMasks) -> None:
-        self._masks[name] = found
-        self._sources |= {_key(name, called): mask for called, mask in found.masks.items()}
+        return parse_structure_set(path, name, self._files.content, series)
 
     def masks(self, name: str) -> dict[str, str]:
         """The structures of such a file: each one's name to that of its volume; none of another file."""
@@ -203,18 +191,6 @@ class CaseVolumes:
     def mask_notes(self, name: str) -> tuple[str, ...]:
         """Notes on the structures of a file of masks."""
         return self._masks[name].notes if name in self._masks else ()
-
-    def _read_series(self, path: Path, name: str, key: str) -> CtSeries:
-        """A folder of slices, or the series of one: every slice is a file that decides."""
-        from puncture_twin.planning.formats.dicom.ct_series import parse_series
-        from puncture_twin.planning.formats.dicom.recognise import choose_series
-
-        chosen = choose_series(path)
-        folder = PurePosixPath(name) if chosen.folder == path else PurePosixPath(name).parent
-        files = [str(folder / file) for file in chosen.names]
-        for file in files:
-            self._files.read("ct", file, max_bytes=MAX_FILE_BYTES, key=key, where=self._path)
-        return parse_series(path, files, self._files.content, chosen.notes)
 
 
 def _key(file: str, called: str) -> str:
@@ -225,27 +201,19 @@ TOP_COUNT_NOTE = (
     "structures = N is at the top of the case, so a cut after the last structure would go unnoticed; state it in "
     "[end], the file's last table"
 )
-
 NOT_LAST_NOTE = "[end] is not the last table of the case: a cut after it would go unnoticed"
-
 ROBOT_NOWHERE = (
     "the case states a robot ({robot}) but not the position of its base: the arm is not checked ([registration] or "
     "[robot.mount] places it)"
 )
-
 _HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([^\[\]\n]+?)[ \t]*\]{1,2}[ \t]*(?:#.*)?$", re.MULTILINE)
 """The header of a table, on a line of its own."""
-
 LINE_FILES = (".csv", ".fcsv")
 """Endings of lists that are read line by line: one that was cut within a number is another number, and looks whole."""
 
 
 def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tuple[str, ...]:
-    """Sentences on files of which it is not known whether they are whole.
-
-    Raises:
-        InputError: A list whose last line does not end.
-    """
+    """Sentences on files that may not be whole. Raises InputError: a list whose last line does not end."""
     for name in dict.fromkeys(one.path for one in files.inputs if one.path.lower().endswith(LINE_FILES)):
         for said in unfinished_warnings(files.content(name), name):
             refuse(said, path, "files in which every line ends with a line break", "file_cut")

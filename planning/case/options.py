@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 
 OPTIONS_ROLE = "options"
 """Of the input that options are."""
@@ -50,11 +50,7 @@ class CaseOptions:
         return f"{{{', '.join(tables)}}}"
 
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
-        """A case file's tables with the options in place; nothing is validated yet.
-
-        Raises:
-            InputError: A margin of what the case has no margin for.
-        """
+        """A case file's tables with the options in place, not validated. Raises InputError: a margin of nothing."""
         changed = copy.deepcopy(data)
         for kind, values in self.sections.items():
             if kind == MOUNT:
@@ -93,19 +89,16 @@ NO_OPTIONS = CaseOptions()
 def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
     """Options from plain values: kind of option to a table of keys and values.
 
-    Raises:
-        InputError: An unknown kind, something that is no table, or a value that is no number, text or list of them.
+    Raises InputError: an unknown kind, something that is no table, or a value that is no number, text or list of them.
     """
     for kind, values in sections.items():
         if kind not in SECTIONS:
             refuse(f"'{kind}' is not a kind of option", where, ", ".join(SECTIONS), "unknown_key")
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
             refuse(f"option '{kind}' is not a table", where, "keys and values, as in the case", "not_a_table")
-    try:
+    allowed = "finite numbers, texts, lists, tables"
+    with refusing((TypeError, ValueError), "an option cannot be used", where, allowed, "bad_value"):
         plain = json.loads(CaseOptions({kind: values for kind, values in sections.items() if values}).text)
-    except (TypeError, ValueError) as error:
-        what = f"an option cannot be used ({error})"
-        raise InputError(what, where=where, allowed="finite numbers, texts, lists, tables", code="bad_value") from error
     if MARGINS in plain:  # of one statement: a pattern before the names that it fits
         plain[MARGINS] = dict(sorted(plain[MARGINS].items()))
     return CaseOptions(plain)

@@ -85,22 +85,15 @@ class SearchSettings:
 class CtSettings:
     """The CT beside the structures."""
 
-    file: str | None = None
-    """Where the skin does not come from a CT, the CT's file, or None."""
-    air_hu: float = tables.AIR_HU
-    """Outside of the body, what is denser is not air."""
-    dense_hu: float = tables.DENSE_HU
-    """Inside the body, what is at least so dense must belong to a structure."""
-    margin_mm: float = 2.0
-    """Clearance that what the CT adds demands."""
-    unnamed: str = "unknown"
-    """What the CT shows inside the body and no structure names: ``unknown``, or ``free``."""
-    trust_labels: bool = False
-    """Whether a person has seen that the structures lie right: no check of that refuses them."""
+    file: str | None = None  # where the skin does not come from a CT, the CT's file, or None
+    air_hu: float = tables.AIR_HU  # outside of the body, what is denser is not air
+    dense_hu: float = tables.DENSE_HU  # inside the body, what is at least so dense must belong to a structure
+    margin_mm: float = 2.0  # clearance that what the CT adds demands
+    unnamed: str = "unknown"  # what the CT shows inside the body and no structure names: ``unknown``, or ``free``
+    trust_labels: bool = False  # whether a person has seen that the structures lie right: no check of that refuses them
     arms: tables.Stated | None = None
     """Whether the image shows arms or other limbs beside the trunk, where a person states it."""
-    table: tables.Stated | None = None
-    """Whether it shows what the body lies on, where a person states it."""
+    table: tables.Stated | None = None  # whether it shows what the body lies on, where a person states it
     beyond_mm: float | None = None
     """How much wider than where the image cuts it the body may be beyond, where a person states it; infinite for all
     that lies beyond the plane of the cut."""
@@ -142,10 +135,8 @@ class RobotSettings:
 
     model: UrModel
     home: Floats | None
-    T_base_ct_mount: Floats | None
-    """Shape (4, 4), mm, where a mount or a transform is stated."""
-    stated: tables.RegistrationSection | None = None
-    """The section that states a transform."""
+    T_base_ct_mount: Floats | None  # shape (4, 4), mm, where a mount or a transform is stated
+    stated: tables.RegistrationSection | None = None  # the section that states a transform
     speeds: SpeedLimits = DEFAULT_SPEEDS
 
     @property
@@ -177,12 +168,9 @@ class Ultrasound:
     T_base_ct_mount: Floats | None
     target_sd_mm: tuple[float, float]
     tip_sd_mm: tuple[float, float]
-    calibration_sd_mm: float
-    """Of the image's place on its arm, per axis."""
-    depth_mm: float
-    """How deep the probe sees."""
-    width_mm: float
-    """Of its footprint."""
+    calibration_sd_mm: float  # of the image's place on its arm, per axis
+    depth_mm: float  # how deep the probe sees
+    width_mm: float  # of its footprint
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,19 +236,16 @@ def gantry_of(gantry: tables.GantrySection, space: Space, path: Path) -> Gantry:
 
 LIKE_METRES = 5.0
 """A base that stands nearer to the CT's origin than this, and not on it, is one in metres: no arm reaches farther."""
-
 AXES_SQUARE_DEG = 1.0
 """A mount's x and z axes may differ from a right angle by this much: what rounding to two digits leaves. More is
 another rotation than was meant, and 1 degree moves the needle's tip by 9 mm at the arm's reach of half a metre."""
-
 Axis = Anatomical | tuple[float, float, float]
 
 
 def mount_pose(mount: tables.MountSection, space: Space, path: Path, *, key: str = "robot.mount") -> Floats:
     """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
 
-    Raises:
-        InputError: The axes are parallel or zero, or not at a right angle, or the position looks like metres.
+    Raises InputError: the axes are parallel or zero, or not at a right angle, or the position looks like metres.
     """
     x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
     lengths = np.linalg.norm(x), np.linalg.norm(z)
@@ -279,11 +264,7 @@ def mount_pose(mount: tables.MountSection, space: Space, path: Path, *, key: str
 
 
 def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
-    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
-
-    Raises:
-        InputError: The two are parallel or zero; names ``key``.
-    """
+    """R_ct_frame (3, 3) of a z axis, and ``x`` as far as square to it. Raises InputError: parallel or zero axes."""
     try:
         return entry_frame(tables.EntryAxes(z=z, x=x), space, where=path)
     except InputError as error:
@@ -295,13 +276,7 @@ URDF_ROLE, MESH_ROLE = "urdf", "urdf mesh"
 
 
 def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
-    """The arm with its home, its speeds, and where it is located, as far as mount or transform say so.
-
-    Each file that decides the arm becomes an input of the case.
-
-    Raises:
-        InputError: An arm, a mount or a transform that cannot be used.
-    """
+    """The arm with its home, speeds and place, where stated; its files become inputs. Raises InputError: unusable."""
     robot, stated, model = content.robot, content.registration, arm_of(content.robot, files, path)
     home = None if robot.home_deg is None else read_only(np.radians(np.asarray(robot.home_deg)))
     mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
@@ -353,11 +328,7 @@ SAME_MM = 0.03
 def bending_of(
     needle: tables.NeedleSection, tissue: Mapping[str, tables.TissueSection], where: str | Path
 ) -> Bending | None:
-    """The bending of a case's needle; None where it declares no tissue.
-
-    Raises:
-        InputError: Half of what is needed, an unknown gauge, or one that is not the needle's diameter.
-    """
+    """The bending of a case's needle; None without tissue. Raises InputError: half of it, or another gauge."""
     stated = [key for key in ("gauge", "solid", "bevel_deg", "modulus_gpa") if getattr(needle, key) is not None]
     if not tissue:
         if stated:
@@ -382,19 +353,14 @@ def _shaft(needle: tables.NeedleSection, where: str | Path) -> Shaft:
         refuse(what, where, f"{min(GAUGES)} to {max(GAUGES)}", "unknown_gauge")
     gauge = GAUGES[needle.gauge]
     if abs(gauge.outer_mm - needle.diameter_mm) > SAME_MM:
-        message = (
-            f"needle.gauge {needle.gauge} is {gauge.outer_mm:g} mm wide, but diameter_mm is {needle.diameter_mm:g}"
-        )
-        refuse(message, where, f"diameter_mm within {SAME_MM:g} of the gauge's", "gauge_contradicted")
+        stated = f"diameter_mm is {needle.diameter_mm:g}"
+        what = f"needle.gauge {needle.gauge} is {gauge.outer_mm:g} mm wide, but {stated}"
+        refuse(what, where, f"diameter_mm within {SAME_MM:g} of the gauge's", "gauge_contradicted")
     return Shaft(needle.shaft_mm, gauge.outer_mm, 0.0 if needle.solid else gauge.inner_mm, modulus)
 
 
 def breathing_of(section: tables.BreathingSection | None, space: Space, where: str | Path) -> Breathing | None:
-    """The breathing of a case; None where it declares none.
-
-    Raises:
-        InputError: A direction without length, or an anatomical one in a space that knows no patient.
-    """
+    """The breathing of a case; None where it declares none. Raises InputError: no direction, or no patient."""
     if section is None:
         return None
     if isinstance(section.direction, str) and space is Space.LOCAL:

@@ -8,22 +8,14 @@ from __future__ import annotations
 import difflib
 import re
 import unicodedata
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy
-from pydantic import (
-    AfterValidator,
-    AllowInfNan,
-    BaseModel,
-    ConfigDict,
-    Field,
-    Strict,
-    StringConstraints,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, StringConstraints, model_validator
 
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS as USUAL, HIGHEST
 from puncture_twin.planning.arm.tool import ToolBody
@@ -50,7 +42,7 @@ def _degrees(value: tuple[float, ...]) -> tuple[float, ...]:
     return value
 
 
-Number = Annotated[float, Strict(), AllowInfNan(False)]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Coordinate = Annotated[Number, Field(ge=-100_000, le=100_000)]
@@ -80,6 +72,15 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    def _problems(self) -> Iterator[SchemaError]:
+        """What is wrong with the keys together; the first is raised."""
+        yield from ()
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Raise the first problem; a validator of its own would name itself in the places of errors."""
+        for problem in self._problems():
+            raise problem
+
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_keys(cls, data: Any) -> Any:
@@ -96,11 +97,9 @@ class Section(BaseModel):
 MAX_STRUCTURES, MAX_LABEL_MAPS = 1000, 100
 """Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree. And tables
 ``[[structures]]``, each with a label map of its own."""
-
 Stated = Literal["none", "present"]
 """What a person says of arms, or of a table, in an image."""
 Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
-
 Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
 Margins = Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)]
 AIR_HU, DENSE_HU = -900.0, 250.0
@@ -125,28 +124,25 @@ class StructureSection(Section):
     cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] | None = None
     hu: Annotated[Number, Field(ge=-1024, le=30_000)] | None = None
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         sources = [key for key in ("mesh", "labelmap", "ct") if getattr(self, key) is not None]
         if len(sources) != 1:
             what = f"'{self.name}' needs exactly one of mesh, labelmap, ct; given: {sources or 'none'}"
-            raise SchemaError(what, "not_one_source")
+            yield SchemaError(what, "not_one_source")
         if (self.labelmap is None) != (self.label is None):
-            raise SchemaError(f"'{self.name}': labelmap and label go together", "keys_together")
+            yield SchemaError(f"'{self.name}': labelmap and label go together", "keys_together")
         if self.mesh is not None and self.unit is None:
             what = f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; mesh files do not state it'
-            raise SchemaError(what, "unit_not_stated")
+            yield SchemaError(what, "unit_not_stated")
         if self.mesh is None and (self.unit or self.space or self.up):
             what = f"'{self.name}': unit, space and up are for a mesh; a volume states its own"
-            raise SchemaError(what, "key_not_of_it")
+            yield SchemaError(what, "key_not_of_it")
         if self.ct is not None and self.role != "skin":
-            raise SchemaError(f"'{self.name}': ct gives only the body's skin; role must be \"skin\"", "key_not_of_it")
+            yield SchemaError(f"'{self.name}': ct gives only the body's skin; role must be \"skin\"", "key_not_of_it")
         if self.cut is not None and self.role != "skin":
-            what = f"'{self.name}': cut is for the skin: it states where the body was cut"
-            raise SchemaError(what, "key_not_of_it")
+            yield SchemaError(f"'{self.name}': cut is for the skin: it states where the body was cut", "key_not_of_it")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
-            raise SchemaError(f'\'{self.name}\': margin_mm is for role "avoid", not "{self.role}"', "key_not_of_it")
-        return self
+            yield SchemaError(f'\'{self.name}\': margin_mm is for role "avoid", not "{self.role}"', "key_not_of_it")
 
 
 class StructuresSection(Section):
@@ -164,22 +160,19 @@ class StructuresSection(Section):
     traverse: Patterns = ()
     ignore: Patterns = ()
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         sources = [key for key in ("labelmap", "masks", "seg", "rtstruct") if getattr(self, key) is not None]
         if len(sources) != 1:
-            raise SchemaError(
+            yield SchemaError(
                 "needs either labelmap (a file) or masks (a folder with one file per structure), not both; "
                 f"or seg (DICOM, or Slicer's .seg.nrrd), or rtstruct; given: {' and '.join(sources) or 'none'}",
                 "not_one_source",
             )
         if self.labelmap is None and self.naming is not None:
             what = "naming is for labelmap; masks are named after their files, SEG and RTSTRUCT state their names"
-            raise SchemaError(what, "key_not_of_it")
+            yield SchemaError(what, "key_not_of_it")
         if self.ct is not None and self.seg is None and self.rtstruct is None:
-            what = "ct is for seg and rtstruct: the DICOM series on which they were drawn"
-            raise SchemaError(what, "key_not_of_it")
-        return self
+            yield SchemaError("ct is for seg and rtstruct: the DICOM series on which they were drawn", "key_not_of_it")
 
     @property
     def source(self) -> str:
@@ -207,7 +200,6 @@ class CtSection(Section):
 
 Chance = Annotated[Number, Field(ge=0, le=1)]
 """Or another fraction."""
-
 MAX_DIRECTIONS = 1_000_000
 """Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
 
@@ -232,20 +224,18 @@ class SearchSection(Section):
     max_touch: Chance | None = None
     max_touch_of: Annotated[dict[Text, Chance], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
 
-    @model_validator(mode="after")
-    def _grid_fits(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         rows = float(np.prod([(high - low) / self.step_deg + 1 for low, high in (self.theta_deg, self.beta_deg)]))
         if rows > MAX_DIRECTIONS:
             what = f"step_deg {self.step_deg:g} makes {rows:,.0f} directions; {MAX_DIRECTIONS:,} at most"
-            raise SchemaError(what, "too_many")
+            yield SchemaError(what, "too_many")
         for key in ("theta_deg", "beta_deg"):
             low, high = getattr(self, key)
             if low > high:
-                raise SchemaError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]", "range_descends")
+                yield SchemaError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]", "range_descends")
             if 0 < high - low < self.step_deg:
                 what = f"step_deg {self.step_deg:g} is larger than the range {key} [{low:g}, {high:g}]"
-                raise SchemaError(what, "step_too_large")
-        return self
+                yield SchemaError(what, "step_too_large")
 
 
 class RankingSection(Section):
@@ -258,11 +248,9 @@ class RankingSection(Section):
     reach: Weight = 0.5
     safe_cone: Weight = 0.5
 
-    @model_validator(mode="after")
-    def _one_counts(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if not any(getattr(self, name) > 0 for name in type(self).model_fields):
-            raise SchemaError("every weight is 0; at least one must be above 0", "no_weight")
-        return self
+            yield SchemaError("every weight is 0; at least one must be above 0", "no_weight")
 
 
 Force = Annotated[Number, Field(ge=0, le=50)]
@@ -283,17 +271,15 @@ class NeedleSection(Section):
     bevel_deg: Annotated[Number, Field(ge=0, le=10)] | None = None
     modulus_gpa: Annotated[Number, Field(ge=1, le=1000)] | None = None
 
-    @model_validator(mode="after")
-    def _shaft_fits(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if self.shaft_mm > self.length_mm:
-            raise SchemaError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}", "out_of_range")
+            yield SchemaError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}", "out_of_range")
         least = self.length_mm - self.shaft_mm + 10.0
         if self.lengths_mm and (self.length_mm not in self.lengths_mm or min(self.lengths_mm) < least):
             what = f"lengths_mm must include length_mm, and none below {least:g} mm (the holder, and 10 mm of shaft)"
-            raise SchemaError(what, "out_of_range")
+            yield SchemaError(what, "out_of_range")
         if self.solid is not None and self.gauge is None:
-            raise SchemaError("solid is for gauge; without gauge the shaft is solid, of diameter_mm", "key_not_of_it")
-        return self
+            yield SchemaError("solid is for gauge; without gauge the shaft is solid, of diameter_mm", "key_not_of_it")
 
 
 class TissueSection(Section):
@@ -306,12 +292,10 @@ class TissueSection(Section):
     capsule_mm: Annotated[Number, Field(ge=0, le=50)] = 0.0
     held_n_mm: Annotated[Number, Field(ge=0.01, le=1000)] | None = None
 
-    @model_validator(mode="after")
-    def _capsule_is_whole(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if (self.capsule_n > 0) != (self.capsule_mm > 0):
             what = "capsule_n and capsule_mm go together: force at the rupture, and its depth"
-            raise SchemaError(what, "keys_together")
-        return self
+            yield SchemaError(what, "keys_together")
 
 
 class TargetSection(Section):
@@ -323,14 +307,12 @@ class TargetSection(Section):
     structure: StructureName | None = None
     hit_radius_mm: Annotated[Number, Field(gt=0, le=100)] | None = None
 
-    @model_validator(mode="after")
-    def _one_position(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if (self.position_mm is None) == (self.points is None):
             what = "needs either position_mm or points (a file, with the target's name), not both"
-            raise SchemaError(what, "not_one_source")
+            yield SchemaError(what, "not_one_source")
         if self.structure is None and self.hit_radius_mm is None:
-            raise SchemaError("needs structure, or hit_radius_mm if the target lies in no structure", "missing_key")
-        return self
+            yield SchemaError("needs structure, or hit_radius_mm if the target lies in no structure", "missing_key")
 
 
 Turn = Annotated[Number, Field(ge=-720, le=720)]
@@ -346,15 +328,13 @@ class LimitsSection(Section):
     highest_deg: Turns | None = None
     max_speed_deg_s: Speeds | None = None
 
-    @model_validator(mode="after")
-    def _ranges_ascend(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if (self.lowest_deg is None) != (self.highest_deg is None):
-            raise SchemaError("lowest_deg and highest_deg go together", "keys_together")
+            yield SchemaError("lowest_deg and highest_deg go together", "keys_together")
         for joint, (low, high) in enumerate(zip(self.lowest_deg or (), self.highest_deg or (), strict=True)):
             if not low < high:
                 what = f"joint {joint + 1}: lowest_deg {low:g} is not below highest_deg {high:g}"
-                raise SchemaError(what, "range_descends")
-        return self
+                yield SchemaError(what, "range_descends")
 
 
 class MountSection(Section):
@@ -379,16 +359,14 @@ class RobotSection(Section):
     joint_speed_fraction: Annotated[Number, Field(ge=0.01, le=1)] = USUAL.joint_speed_fraction
     joint_acceleration_fraction: Annotated[Number, Field(ge=0.01, le=1)] = USUAL.joint_acceleration_fraction
 
-    @model_validator(mode="after")
-    def _one_arm(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if self.urdf is not None and "model" in self.model_fields_set:
-            raise SchemaError("model and urdf both state the arm; keep one", "stated_twice")
+            yield SchemaError("model and urdf both state the arm; keep one", "stated_twice")
         if self.urdf is None and "flange" in self.model_fields_set:
-            raise SchemaError("flange names a link of urdf, and urdf is missing", "key_not_of_it")
+            yield SchemaError("flange names a link of urdf, and urdf is missing", "key_not_of_it")
         if self.insertion_speed_mm_s > self.tip_speed_mm_s:
             what = f"insertion_speed_mm_s {self.insertion_speed_mm_s:g} is above tip_speed_mm_s {self.tip_speed_mm_s:g}"
-            raise SchemaError(what, "out_of_range")
-        return self
+            yield SchemaError(what, "out_of_range")
 
 
 Range = tuple[Coordinate, Coordinate]
@@ -402,14 +380,12 @@ class MountBounds(Section):
     across_mm: Range | None = None
     height_mm: Range | None = None
 
-    @model_validator(mode="after")
-    def _ranges_ascend(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         for key in ("along_mm", "across_mm", "height_mm"):
             bounds = getattr(self, key)
             if bounds is not None and bounds[0] > bounds[1]:
                 what = f"{key} [{bounds[0]:g}, {bounds[1]:g}] descends; it is [lowest, highest]"
-                raise SchemaError(what, "range_descends")
-        return self
+                yield SchemaError(what, "range_descends")
 
 
 class PlaceSection(Section):
@@ -426,13 +402,11 @@ class PlaceSection(Section):
     ceiling: MountBounds = MountBounds()
     side: MountBounds = MountBounds()
 
-    @model_validator(mode="after")
-    def _mounts_make_sense(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if self.mounts is not None and (not self.mounts or len(set(self.mounts)) < len(self.mounts)):
-            raise SchemaError(f"mounts {list(self.mounts)}: must have at least one, each once", "duplicate_name")
+            yield SchemaError(f"mounts {list(self.mounts)}: must have at least one, each once", "duplicate_name")
         if self.rail.across_mm is not None:
-            raise SchemaError("rail.across_mm: a rail is next to the table; use rail_gap_mm", "key_not_of_it")
-        return self
+            yield SchemaError("rail.across_mm: a rail is next to the table; use rail_gap_mm", "key_not_of_it")
 
 
 RAS_OF_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -461,42 +435,38 @@ class RegistrationSection(Section):
     transform_maps: Literal["base_to_ct", "ct_to_base"] | None = None
     base_axes: Literal["LPS", "RAS"] | None = None
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if self.correct_joints_deg is not None and not self.correct:
-            raise SchemaError("correct_joints_deg needs correct = true, the correction for it", "keys_together")
+            yield SchemaError("correct_joints_deg needs correct = true, the correction for it", "keys_together")
         if self.correct and self.method not in {None, "weighted"}:
-            what = f'correct = true has its own fit; method "{self.method}" has another'
-            raise SchemaError(what, "conflicting_keys")
+            yield SchemaError(f'correct = true has its own fit; method "{self.method}" has another', "conflicting_keys")
         markers = [key for key in ("markers_ct", "markers_base") if getattr(self, key) is None]
         if self.transform is None:
             if markers:
                 what = f"{' and '.join(markers)}: missing; markers_ct and markers_base, or transform"
-                raise SchemaError(what, "missing_key")
+                yield SchemaError(what, "missing_key")
             if self.transform_maps or self.base_axes:
-                raise SchemaError("transform_maps and base_axes are for transform", "key_not_of_it")
-            return self
+                yield SchemaError("transform_maps and base_axes are for transform", "key_not_of_it")
+            return
         if len(markers) == 1:
             what = f"{markers[0]}: missing; with transform, give both lists of markers, to check it"
-            raise SchemaError(what, "missing_key")
+            yield SchemaError(what, "missing_key")
         placing = (*_OF_MARKERS, *_OF_COMPARISON) if markers else _OF_MARKERS
         given = [key for key in placing if getattr(self, key)]
         if given:
-            what = f"transform replaces markers; {', '.join(given)} is for markers"
-            raise SchemaError(what, "key_not_of_it")
+            yield SchemaError(f"transform replaces markers; {', '.join(given)} is for markers", "key_not_of_it")
         if self.transform_maps is None:
-            raise SchemaError(
+            yield SchemaError(
                 'transform needs transform_maps = "base_to_ct" (as Slicer saves a transform from the CT to the '
                 'robot) or "ct_to_base": the file does not state its direction',
                 "missing_key",
             )
         if self.base_axes is None:
-            raise SchemaError(
+            yield SchemaError(
                 'transform needs base_axes = "RAS" (the robot\'s x, y, z are what Slicer shows as R, A, S) or "LPS" '
                 "(the file has them unchanged)",
                 "missing_key",
             )
-        return self
 
 
 class MarkerSection(RegistrationSection):
@@ -558,12 +528,10 @@ class ErrorsSection(Section):
     needle_direction_deg: Degrees = 0.2
     surface_mm: Millimetres | None = None
 
-    @model_validator(mode="after")
-    def _cell_or_deviation(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         for cell, deviation in (("ct_pixel_mm", "ct_in_plane_mm"), ("ct_spacing_mm", "ct_slice_mm")):
             if getattr(self, cell) is not None and getattr(self, deviation) is not None:
-                raise SchemaError(f"{cell} and {deviation} state the same error; keep one", "stated_twice")
-        return self
+                yield SchemaError(f"{cell} and {deviation} state the same error; keep one", "stated_twice")
 
 
 class RehearsalSection(Section):
@@ -593,12 +561,10 @@ class BreathingSection(Section):
     scanned_at: Chance = 0.0
     gate: Chance | None = None
 
-    @model_validator(mode="after")
-    def _full_inhale_is_a_phase(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if self.phases > 1 and self.phases % 2:
             what = f"phases {self.phases}: must be 1, or an even number, so that full inhale is one of them"
-            raise SchemaError(what, "out_of_range")
-        return self
+            yield SchemaError(what, "out_of_range")
 
 
 Deviation = Annotated[Number, Field(gt=0, le=10)]
@@ -614,13 +580,11 @@ class StereoSection(Section):
     balls_mm: Annotated[tuple[Along, ...], Field(min_length=1, max_length=4)] = (80.0, 160.0)
     sd_mm: Deviation = 0.03
 
-    @model_validator(mode="after")
-    def _two_places_and_ascending(self) -> Self:
+    def _problems(self) -> Iterator[SchemaError]:
         if self.cameras_mm is not None and self.cameras_mm[0] == self.cameras_mm[1]:
-            raise SchemaError("cameras_mm: both cameras are at one place, which shows no depth", "out_of_range")
+            yield SchemaError("cameras_mm: both cameras are at one place, which shows no depth", "out_of_range")
         if any(high <= low for low, high in pairwise(self.balls_mm)):
-            raise SchemaError(f"balls_mm {list(self.balls_mm)} does not ascend, from the tip on", "range_descends")
-        return self
+            yield SchemaError(f"balls_mm {list(self.balls_mm)} does not ascend, from the tip on", "range_descends")
 
 
 class UltrasoundSection(Section):
@@ -676,7 +640,6 @@ class GantrySection(Section):
 
 TOOL_ROLE = "tool mesh"
 """Of the file that decides a tool."""
-
 Beside = Annotated[Number, Field(ge=-1000, le=1000)]
 ToolTurn = Annotated[Number, Field(ge=-360, le=360)]
 
@@ -694,8 +657,7 @@ class ToolSection(Section):
 def tool_of(section: ToolSection | None, files: InputFiles, path: Path) -> ToolBody | None:
     """The tool's body, turned about the flange's x, y and z, in this order, then moved; its file becomes an input.
 
-    Raises:
-        InputError: A file that cannot be used, or a unit that is not known.
+    Raises InputError: a file that cannot be used, or a unit that is not known.
     """
     if section is None:
         return None

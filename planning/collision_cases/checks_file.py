@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field, StringConstraints, ValidationError, model_validator
+from pydantic import Field, StringConstraints, ValidationError
 
 from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
 from puncture_twin.planning.base.reasons import Reason
@@ -22,10 +22,8 @@ ALLOWED = "[[check]], [[window]] or [[plan]] tables"
 KEYS = "docs/how-to/collision-cases.md"
 DEFAULT_TOLERANCE_MM, MOST_TOLERANCE_MM = 0.01, 10.0
 """A tenth of the 0.1 mm to which a robot repeats itself; a clearance that may be off by more is not checked at all."""
-
 TestName = Annotated[str, StringConstraints(pattern=r"^[^\s:\[\]/\\]([^:\[\]/\\]*[^\s:\[\]/\\])?$", max_length=80)]
 """What pytest can select a test by: without the signs of its own names."""
-
 Mark = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=80)]
 Chance = Annotated[Number, Field(ge=0, le=1)]
 
@@ -37,11 +35,6 @@ class Expectation(Section):
     name: TestName | None = None
     why: str = ""
     marks: tuple[Mark, ...] = ()
-
-    @property
-    def usual_name(self) -> str:
-        """Name of a test without its own; independent of the place in the file."""
-        raise NotImplementedError
 
 
 class CheckSection(Expectation):
@@ -58,11 +51,6 @@ class CheckSection(Expectation):
     max_touch: Chance | None = None
     arm: Yes = False
 
-    @property
-    def usual_name(self) -> str:
-        """Angles and verdict as the test's name."""
-        return f"theta{self.theta_deg:g}-beta{self.beta_deg:g}-{self.verdict}"
-
 
 class WindowSection(Expectation):
     """Expectation of the window that contains one direction."""
@@ -72,21 +60,11 @@ class WindowSection(Expectation):
     min_square_deg: Positive
     arm: Yes = False
 
-    @property
-    def usual_name(self) -> str:
-        """The direction as the test's name."""
-        return f"window-theta{self.theta_deg:g}-beta{self.beta_deg:g}"
-
 
 class PlanSection(Expectation):
     """Expectation of a plan that must still be valid."""
 
     file: Text
-
-    @property
-    def usual_name(self) -> str:
-        """The file as the test's name."""
-        return "plan-" + "-".join(Path(self.file).parts[-2:])
 
 
 class ChecksFile(Section):
@@ -97,11 +75,9 @@ class ChecksFile(Section):
     window: tuple[WindowSection, ...] = ()
     plan: tuple[PlanSection, ...] = ()
 
-    @model_validator(mode="after")
-    def _refuse_nothing(self) -> ChecksFile:
+    def _problems(self) -> Iterator[SchemaError]:
         if not (self.check or self.window or self.plan):
-            raise SchemaError(f"the file expects nothing; it has no {ALLOWED}", "missing_key")
-        return self
+            yield SchemaError(f"the file expects nothing; it has no {ALLOWED}", "missing_key")
 
     def tables(self) -> dict[str, tuple[Expectation, ...]]:
         """Kind of table to the tables, in the file's order."""
@@ -123,8 +99,7 @@ def read_checks(path: Path) -> CheckedFile:
     except InputError as error:
         if not isinstance(error.__cause__, ValidationError):
             raise
-        place = error.__cause__.errors(include_url=False)[0]["loc"]
-        raise error.at(_where(data, path, place)) from error
+        raise error.at(_where(data, path, error.__cause__.errors(include_url=False)[0]["loc"])) from error
     for kind, expectations in content.tables().items():
         for at, table in enumerate(expectations):
             if (table.case or content.case) is None:
@@ -142,8 +117,7 @@ TOKENS = re.compile(
     r'"""(?:\\.|[^\\])*?"""'
     r"|'''.*?'''"
     r'|"(?:\\.|[^"\\\n])*"'
-    r"|'[^'\n]*'"
-    r"|\#[^\n]*"
+    r"|'[^'\n]*'|\#[^\n]*"
     r"|^[ \t]*\[\[[ \t]*(?P<kind>[A-Za-z0-9_-]+)[ \t]*\]\]",
     re.MULTILINE | re.DOTALL,
 )

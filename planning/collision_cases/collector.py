@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR
 from pathlib import Path
@@ -13,18 +13,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision_cases import checks_file
-from puncture_twin.planning.collision_cases.session import (
-    ARM_PROPERTY,
-    UPDATE,
-    Change,
-    Difference,
-    Finding,
-    NewNumber,
-    Session,
-    session_of,
-    updating,
-)
+from puncture_twin.planning.collision_cases import checks_file, session as runs
+from puncture_twin.planning.collision_cases.session import Difference, Finding, NewNumber, Session, session_of, updating
 from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.search.candidates import Candidates
@@ -35,7 +25,6 @@ from puncture_twin.planning.search.windows import nearest_row
 DIGIT, LEAST_DIGIT_MM, CHANCE_DIGIT, DIGIT_SQUARE_DEG = 0.1, 0.01, 0.01, 1.0
 """Steps of rewritten numbers: a fraction of a tolerance, which keeps the rest; of a least clearance, mm; of a chance
 (relative); and of an area."""
-
 MOST_SHOWN = 6
 """Windows."""
 
@@ -75,10 +64,9 @@ def _clearances(check: checks_file.CheckSection, found: Explanation) -> Iterator
 
 def _least(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
     want, got = check.min_clearance_mm, float(found.candidates.least_clearance[0])
-    if want is None or got >= want:
-        return
-    line = f"min_clearance_mm: expected at least {want:g} mm, found {got:.4f} mm, {found.nearest_demanding()}"
-    yield Difference(line, _number(NewNumber(("min_clearance_mm",), got, LEAST_DIGIT_MM, ROUND_FLOOR)))
+    if want is not None and not got >= want:
+        line = f"min_clearance_mm: expected at least {want:g} mm, found {got:.4f} mm, {found.nearest_demanding()}"
+        yield Difference(line, _number(NewNumber(("min_clearance_mm",), got, LEAST_DIGIT_MM, ROUND_FLOOR)))
 
 
 def _touch(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
@@ -131,7 +119,7 @@ def _angles(candidates: Candidates, row: int) -> str:
     return f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
 
 
-ONLY_NUMBERS = f"{UPDATE} rewrites only numbers: change verdict, reason, structure and plans by hand"
+ONLY_NUMBERS = f"{runs.UPDATE} rewrites only numbers: change verdict, reason, structure and plans by hand"
 
 
 class CollisionMismatchError(AssertionError):
@@ -159,7 +147,7 @@ class CollisionFile(pytest.File):
             tables = list(_tables(*checks_file.read_checks(self.path), self.path.parent))
         except InputError as error:
             raise self.CollectError(str(error)) from error
-        names = unique_names(table.expected.name or table.expected.usual_name for table in tables)
+        names = unique_names(table.expected.name or usual_name(table.expected) for table in tables)
         for name, table in zip(names, tables, strict=True):
             item = CollisionItem.from_parent(self, name=name, table=table)
             try:
@@ -190,13 +178,13 @@ class CollisionItem(pytest.Item):
         session, table = session_of(self.config), self._table
         if table.kind != "plan":
             context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
-            self.user_properties += [("case", str(table.case)), (ARM_PROPERTY, context.arm_note)]
-        found = FINDERS[table.kind](session, table, self.path.parent)
+            self.user_properties += [("case", str(table.case)), (runs.ARM_PROPERTY, context.arm_note)]
+        found = _found(session, table, self.path.parent)
         numbers = [one.number for one in found.differences if one.number is not None]
         if len(numbers) < len(found.differences) or (numbers and not updating(self.config)):
             raise CollisionMismatchError(found.text(table.expected.why))
         for number in numbers:
-            session.change(self.path, table.data, Change(table.kind, table.at, self.name, number))
+            session.change(self.path, table.data, runs.Change(table.kind, table.at, self.name, number))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """The differences, in a few lines."""
@@ -227,30 +215,25 @@ def _explained(session: Session, case: Path, check: checks_file.CheckSection) ->
     return context.explain(float(np.radians(check.theta_deg)), float(np.radians(check.beta_deg)))
 
 
-def _direction(session: Session, table: Table, folder: Path) -> Finding:
-    assert isinstance(table.expected, checks_file.CheckSection)
-    return direction_finding(table.expected, _explained(session, table.case, table.expected))
-
-
-def _window(session: Session, table: Table, folder: Path) -> Finding:
+def _found(session: Session, table: Table, folder: Path) -> Finding:
     expected = table.expected
-    assert isinstance(expected, checks_file.WindowSection)
-    context = session.context(table.case, arm=expected.arm)
-    direction = context.check(float(np.radians(expected.theta_deg)), float(np.radians(expected.beta_deg)))
-    return window_finding(expected, direction, session.search(table.case, arm=expected.arm))
+    if isinstance(expected, checks_file.CheckSection):
+        return direction_finding(expected, _explained(session, table.case, expected))
+    if isinstance(expected, checks_file.WindowSection):
+        context = session.context(table.case, arm=expected.arm)
+        direction = context.check(float(np.radians(expected.theta_deg)), float(np.radians(expected.beta_deg)))
+        return window_finding(expected, direction, session.search(table.case, arm=expected.arm))
+    assert isinstance(expected, checks_file.PlanSection)
+    return plan_finding(folder / expected.file, session.context(table.case, arm=True))
 
 
-def _plan(session: Session, table: Table, folder: Path) -> Finding:
-    assert isinstance(table.expected, checks_file.PlanSection)
-    return plan_finding(folder / table.expected.file, session.context(table.case, arm=True))
-
-
-FINDERS: Mapping[str, Callable[[Session, Table, Path], Finding]] = {
-    "check": _direction,
-    "window": _window,
-    "plan": _plan,
-}
-"""Kind of table to what checks it."""
+def usual_name(expected: checks_file.Expectation) -> str:
+    """Name of a test without its own, by what it expects; independent of the place in the file."""
+    if isinstance(expected, checks_file.PlanSection):
+        return "plan-" + "-".join(Path(expected.file).parts[-2:])
+    assert isinstance(expected, checks_file.CheckSection | checks_file.WindowSection)
+    at = f"theta{expected.theta_deg:g}-beta{expected.beta_deg:g}"
+    return f"{at}-{expected.verdict}" if isinstance(expected, checks_file.CheckSection) else f"window-{at}"
 
 
 def unique_names(wanted: Iterable[str]) -> list[str]:
@@ -270,7 +253,6 @@ def plan_finding(path: Path, context: CaseContext) -> Finding:
     try:
         check_plan(read_plan(path), context, path)
     except InputError as error:
-        return Finding(
-            (Difference(f"the plan is not valid any more: {error.what}"),), (f"{error.where}: {error.allowed}",)
-        )
+        differs = Difference(f"the plan is not valid any more: {error.what}")
+        return Finding((differs,), (f"{error.where}: {error.allowed}",))
     return Finding()

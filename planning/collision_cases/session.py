@@ -81,9 +81,7 @@ def write_changes(config: pytest.Config) -> bool:
 
 ARM_PROPERTY = "arm"
 """Name of a property of a test's report: it comes back from other processes too, and into JUnit's file."""
-
 CHECKED = "checked"
-
 UPDATE = "--collision-update"
 SEVERAL = f"{UPDATE} rewrites files: run it in one process, without -n"
 
@@ -118,11 +116,7 @@ class Change:
 
 
 def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
-    """Rewrite a file, whole or not at all; one line a number: where, old and new.
-
-    Raises:
-        InputError: The file is another one by now, or cannot be written.
-    """
+    """Rewrite a file, whole or not at all; a line a number: where, old, new. Raises InputError: it is another now."""
     path = path.resolve()
     if path.read_bytes() != data:
         refuse("changed while the tests ran", path, "an unchanged file: run again", "input_changed")
@@ -159,7 +153,6 @@ def _at(document: Any, keys: Sequence[str | int]) -> Any:
 
 MOST_DECIMALS = 17
 """Decimals of a written number: more than a double has."""
-
 MOST_LINES, MOST_DIFFERENCES, MOST_CHARACTERS = 15, 6, 300
 """Of a failure: more is not read. Of its lines that say what differs; and of a line."""
 

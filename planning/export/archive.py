@@ -35,7 +35,6 @@ DICOM = "dicom"
 """The format's name."""
 SEGMENTS, REPORT = "segments.dcm", "report.dcm"
 NAMES = (SEGMENTS, REPORT)
-
 MAKER = "puncture_twin"
 SCHEME = "99PUNCTURETWIN"
 """Of the codes that no public scheme has."""
@@ -51,8 +50,6 @@ TYPE_2 = (
     *("AccessionNumber", "ReferringPhysicianName"),
 )
 """A slice that leaves one of these out gives it as empty: DICOM allows both to be unknown."""
-
-
 WHOSE = ("PatientID", "PatientName", "PatientBirthDate", "StudyInstanceUID")
 """What all slices must say alike."""
 
@@ -88,8 +85,8 @@ def archive_files(scan: CtSeries, content: ArchiveContent) -> dict[str, bytes]:
     """The segmentation and the report, by their names.
 
     Raises:
-        InputError: A scan without a frame of reference, of several patients or in several multi-frame files, a region
-            outside of it, or highdicom is not installed.
+        InputError: A scan without a frame of reference, of several patients or multi-frame files, a region outside,
+            or highdicom is not installed.
     """
     if not scan.frame_of_reference:
         what = "the scan states no frame of reference: nothing can refer to its coordinates"
@@ -171,17 +168,10 @@ def surface_points(points_ct: Floats, faces: Ints, step_mm: float) -> Floats:
 def _series(title: str, number: int) -> dict[str, Any]:
     """What identifies an object: a new instance in a series of its own, since its date and time are new too."""
     own = version("puncture-twin")
-    return {
-        "series_instance_uid": generate_uid(),
-        "series_number": number,
-        "series_description": title[:64],
-        "sop_instance_uid": generate_uid(),
-        "instance_number": 1,
-        "manufacturer": MAKER,
-        "manufacturer_model_name": MAKER,
-        "software_versions": own,
-        "device_serial_number": own,
-    }
+    series = {"series_instance_uid": generate_uid(), "series_number": number, "series_description": title[:64]}
+    instance = {"sop_instance_uid": generate_uid(), "instance_number": 1, "manufacturer": MAKER}
+    made_by = {"manufacturer_model_name": MAKER, "software_versions": own, "device_serial_number": own}
+    return {**series, **instance, **made_by}
 
 
 def _segmentation(sources: list[Dataset], scan: CtSeries, content: ArchiveContent, masks: Sequence[Bools]) -> Dataset:
@@ -217,19 +207,14 @@ def _segmentation(sources: list[Dataset], scan: CtSeries, content: ArchiveConten
 def _report(sources: list[Dataset], scan: CtSeries, content: ArchiveContent) -> Dataset:
     hd = _highdicom()
     root = hd.sr.ContainerContentItem(name=_named(content.title))
-    items: list[Dataset] = [
-        hd.sr.TextContentItem(_named(heading), sentence, relationship_type="CONTAINS")
-        for heading, sentence in content.sentences
-    ]
+    within = {"relationship_type": "CONTAINS"}
+    items: list[Dataset] = [hd.sr.TextContentItem(_named(head), said, **within) for head, said in content.sentences]
     for name, points in content.lines.items():
-        kind = "POINT" if len(points) == 1 else "POLYLINE"
-        where = np.asarray(points, np.float64)
-        items.append(
-            hd.sr.Scoord3DContentItem(_named(name), kind, where, scan.frame_of_reference, relationship_type="CONTAINS")
-        )
+        kind, where = "POINT" if len(points) == 1 else "POLYLINE", np.asarray(points, np.float64)
+        items.append(hd.sr.Scoord3DContentItem(_named(name), kind, where, scan.frame_of_reference, **within))
     for one in content.quantities:
         unit = Code(UNITS[one.unit], "UCUM", one.unit or "no units")
-        items.append(hd.sr.NumContentItem(_named(one.name), one.value, unit, relationship_type="CONTAINS"))
+        items.append(hd.sr.NumContentItem(_named(one.name), one.value, unit, **within))
     root.ContentSequence = hd.sr.ContentSequence(items)
     return hd.sr.Comprehensive3DSR(
         evidence=sources,
@@ -270,14 +255,10 @@ def _check_segments(data: bytes, scan: CtSeries, regions: Sequence[Region], mask
 
 def _check_report(data: bytes, content: ArchiveContent) -> None:
     """Read the report; lines must be equal in single precision, which DICOM has for them, all else exactly."""
-    read = report_content(data)
-    same = read == ArchiveText(
-        content.title[:64],
-        {name: np.asarray(points, np.float32).astype(float).tolist() for name, points in content.lines.items()},
-        {one.name[:64]: (one.value, UNITS[one.unit]) for one in content.quantities},
-        tuple((heading[:64], sentence) for heading, sentence in content.sentences),
-    )
-    if not same:
+    lines = {name: np.asarray(points, np.float32).astype(float).tolist() for name, points in content.lines.items()}
+    quantities = {one.name[:64]: (one.value, UNITS[one.unit]) for one in content.quantities}
+    sentences = tuple((heading[:64], sentence) for heading, sentence in content.sentences)
+    if report_content(data) != ArchiveText(content.title[:64], lines, quantities, sentences):
         raise RuntimeError(f"{REPORT} does not read back as it was written")
 
 

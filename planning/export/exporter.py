@@ -24,14 +24,8 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.export.program import (
-    SampledMotion,
-    check_program,
-    check_sampled,
-    heading,
-    program_of,
-    waypoint_rows,
-)
+from puncture_twin.planning.export import program as programs
+from puncture_twin.planning.export.program import SampledMotion, check_sampled, heading
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM
@@ -48,20 +42,14 @@ SMALLEST_BLEND_MM = 1.0
 LARGEST_FRACTION = 0.45
 """Fraction of each segment, so that two blends never overlap: the controller skips a waypoint whose blend overlaps the
 next."""
-
 SAMPLES = 400
 """Along a segment, to find where the tip comes within the radius."""
 
 
 def blend_radii_mm(checker: CellChecker, waypoints: Floats) -> Floats:
-    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
+    """Blend radius of each waypoint (k, 6), rad, between the ends, shape (k - 2,), mm; 0 where no corner may be cut.
 
-    Args:
-        checker: Checks contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
-        waypoints: Shape (k, 6), rad.
-
-    Returns:
-        Shape (k - 2,), mm.
+    ``checker`` has the plan's own scene; its tool has the needle whose tip is the TCP.
     """
     radii = np.zeros(max(len(waypoints) - 2, 0))
     for at, (before, corner, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False)):
@@ -106,7 +94,6 @@ def _triangle(checker: CellChecker, corner: Floats, back: Floats, ahead: Floats)
 
 
 COLUMNS = ("phase", "time_s", *(f"q{joint}_rad" for joint in range(1, 7)))
-
 NOTES = (
     "joint angles of the controller, base to wrist 3; each phase starts at rest, at time 0",
     "the operator starts the insertion: nothing in this table waits",
@@ -168,8 +155,7 @@ def export_plan(
             known off the plan's path, so no corner is rounded, and the file says so.
 
     Raises:
-        InputError: Another format, a plan that contradicts itself, or a number beyond the arm's limits; then nothing
-            is written.
+        InputError: Another format, a plan that contradicts itself, or one beyond the arm's limits; nothing is left.
     """
     path = folder / export_name(source, format_name)
     check_geometry(plan, source)
@@ -187,12 +173,12 @@ def export_name(source: Path, format_name: str) -> str:
 
 
 def _urscript(plan: Plan, source: Path, checker: CellChecker | None) -> _Draft:
-    rows = waypoint_rows(plan)
+    rows = programs.waypoint_rows(plan)
     waypoints = plan.approach.q[rows]
     blends = None if checker is None or len(rows) < 3 else blend_radii_mm(checker, waypoints)
-    program = program_of(plan, blends)
+    program = programs.program_of(plan, blends)
     text = urscript_text(program, plan, case_checked=checker is not None)
-    check_program(read_urscript(text, where=source), plan, blends, where=source)
+    programs.check_program(read_urscript(text, where=source), plan, blends, where=source)
     if len(program.stream_q):
         return _Draft(text, ("the approach is smooth and streamed (servoj): the controller follows it with a lag",))
     rounded = 0 if blends is None else int(np.count_nonzero(blends))
@@ -227,7 +213,6 @@ class Exporter(NamedTuple):
 
 
 Drafting = Callable[[Plan, Path, CellChecker | None], _Draft]
-
 FORMATS: Mapping[str, tuple[str, Drafting]] = MappingProxyType(
     {
         "urscript": (".script", _urscript),
@@ -246,11 +231,7 @@ def format_names() -> tuple[str, ...]:
 
 
 def format_of(name: str) -> tuple[str, Drafting]:
-    """The ending of a format's files, and who writes them.
-
-    Raises:
-        InputError: There is no such format, or its package has no `Exporter` under that name.
-    """
+    """The ending of a format's files, and who writes them. Raises InputError: no such format, or no `Exporter`."""
     if name in FORMATS:
         return FORMATS[name]
     if name not in format_names():

@@ -34,12 +34,9 @@ def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
     """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state."""
     frames = RosFrames.of(model_urdf(plan.model))
     # the skin with all that the CT shows outside of it, in its own frame; the pose says where it lies
-    pose = pose_message(frames.T_root_base @ plan.T_base_ct)
-    patient = {"meshes": [mesh_message(patient_surface(anatomy))], "mesh_poses": [pose]}
+    patient = _mesh(patient_surface(anatomy), frames.T_root_base @ plan.T_base_ct)
     objects = [_object(PATIENT, frames.root) | patient]
-    for box in case_boxes(case, plan.T_base_ct):
-        primitive, pose = box_message(box, frames)
-        objects.append(_object(box.name, frames.root) | {"primitives": [primitive], "primitive_poses": [pose]})
+    objects += [_object(box.name, frames.root) | box_message(box, frames) for box in case_boxes(case, plan.T_base_ct)]
     start = {"name": list(plan.model.joint_names), "position": [float(angle) for angle in plan.approach.q[0]]}
     carried = _attached(case_tool(case), frames)
     return {
@@ -55,13 +52,9 @@ def _attached(tool: Tool, frames: RosFrames) -> list[dict[str, Any]]:
     parts = [(NEEDLE, *ends, tool.needle_diameter_mm)]
     if ends[0] > 0:
         parts.insert(0, (HOLDER, 0.0, ends[0], tool.holder_diameter_mm))
-    bodies = []
-    for name, start, end, diameter in parts:
-        primitive, pose = cylinder_message(start, end, diameter)
-        bodies.append(_object(name, frames.flange) | {"primitives": [primitive], "primitive_poses": [pose]})
+    bodies = [_object(name, frames.flange) | cylinder_message(start, end, wide) for name, start, end, wide in parts]
     if tool.body is not None:
-        meshes = {"meshes": [mesh_message(tool.body.mesh)], "mesh_poses": [pose_message(np.eye(4))]}
-        bodies.append(_object("tool", frames.flange) | meshes)
+        bodies.append(_object("tool", frames.flange) | _mesh(tool.body.mesh, np.eye(4)))
     return [{"link_name": frames.flange, "object": one, "touch_links": list(frames.touching)} for one in bodies]
 
 
@@ -110,7 +103,6 @@ def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
 
 
 MOVEIT = "moveit"
-
 SCENE, GOALS, URDF, SENDER = "scene.json", "goals.json", "urdf", "send.py"
 """Ends of the files' names, in the order of `moveit_names`."""
 SENDER_TEXT = '''"""Give MoveIt the scene, send one phase: python {sender} approach|insertion. Research software."""
@@ -139,11 +131,7 @@ def moveit_names(stem: str) -> tuple[str, ...]:
 
 
 def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> Mapping[str, str]:
-    """Name to text of the MoveIt files.
-
-    Raises:
-        InputError: A plan that contradicts itself, or a number beyond the arm's limits.
-    """
+    """Name to text of the MoveIt files. Raises InputError: a plan that contradicts itself, or breaks a limit."""
     check_geometry(plan, source)
     names = moveit_names(source.stem)
     goals = _json({**goal_messages(plan), "warnings": warning_lines(plan.warnings)})
@@ -160,7 +148,6 @@ def _json(document: object) -> str:
 
 
 M_PER_MM = 1e-3
-
 BOX, CYLINDER = 1, 3
 """Of ``shape_msgs/SolidPrimitive``."""
 GRAIN_M = 1e-6
@@ -170,23 +157,18 @@ GRAIN_M = 1e-6
 class RosFrames(NamedTuple):
     """The links of an arm's URDF in which messages speak."""
 
-    root: str
-    """The root, of a UR ``base_link``: the controller's base rotated by 180 deg about z."""
-    flange: str
-    """The controller's flange, of a UR ``tool0``."""
-    touching: tuple[str, ...]
-    """What holder and needle are bolted to."""
-    T_root_base: Floats
-    """Shape (4, 4), mm: the controller's base in the root's frame."""
+    root: str  # the root, of a UR ``base_link``: the controller's base rotated by 180 deg about z
+    flange: str  # the controller's flange, of a UR ``tool0``
+    touching: tuple[str, ...]  # what holder and needle are bolted to
+    T_root_base: Floats  # shape (4, 4), mm: the controller's base in the root's frame
 
     @classmethod
     def of(cls, urdf: ArmUrdf) -> RosFrames:
         """The frames of an arm."""
         last = [member.link.name for member in urdf.chain.bodies[-1]]
         touching = dict.fromkeys((last[0], "flange", urdf.chain.flange, *last[1:]))
-        return cls(
-            urdf.root, urdf.chain.flange, tuple(touching), np.asarray(np.linalg.inv(urdf.T_base_root), np.float64)
-        )
+        T_root_base = np.asarray(np.linalg.inv(urdf.T_base_root), np.float64)
+        return cls(urdf.root, urdf.chain.flange, tuple(touching), T_root_base)
 
 
 def pose_message(T: Floats) -> dict[str, Any]:
@@ -195,27 +177,27 @@ def pose_message(T: Floats) -> dict[str, Any]:
     return {"position": _named("xyz", T[:3, 3] * M_PER_MM), "orientation": _named("xyzw", quaternion)}
 
 
-def box_message(box: Box, frames: RosFrames) -> tuple[dict[str, Any], dict[str, Any]]:
+def box_message(box: Box, frames: RosFrames) -> dict[str, Any]:
     """``shape_msgs/SolidPrimitive`` of a box in the controller's base frame, and its pose in the root's."""
-    sides = [float(side) * M_PER_MM for side in box.size_mm]
-    return {"type": BOX, "dimensions": sides}, pose_message(frames.T_root_base @ box.T_base_box)
+    return _primitive(BOX, [float(side) * M_PER_MM for side in box.size_mm], frames.T_root_base @ box.T_base_box)
 
 
-def cylinder_message(start_mm: float, end_mm: float, diameter_mm: float) -> tuple[dict[str, Any], dict[str, Any]]:
+def cylinder_message(start_mm: float, end_mm: float, diameter_mm: float) -> dict[str, Any]:
     """A cylinder along z of the flange, and its pose there: about its middle, as the definition has it."""
     T = np.eye(4)
     T[2, 3] = (start_mm + end_mm) / 2
-    size = [(end_mm - start_mm) * M_PER_MM, diameter_mm / 2 * M_PER_MM]
-    return {"type": CYLINDER, "dimensions": size}, pose_message(T)
+    return _primitive(CYLINDER, [(end_mm - start_mm) * M_PER_MM, diameter_mm / 2 * M_PER_MM], T)
 
 
-def mesh_message(mesh: TriangleMesh) -> dict[str, Any]:
-    """``shape_msgs/Mesh`` of a surface in mm."""
-    vertices = np.round(mesh.vertices * M_PER_MM / GRAIN_M) * GRAIN_M
-    return {
-        "triangles": [{"vertex_indices": [int(i) for i in face]} for face in mesh.faces],
-        "vertices": [_named("xyz", vertex) for vertex in vertices],
-    }
+def _primitive(kind: int, dimensions: list[float], T: Floats) -> dict[str, Any]:
+    return {"primitives": [{"type": kind, "dimensions": dimensions}], "primitive_poses": [pose_message(T)]}
+
+
+def _mesh(mesh: TriangleMesh, T: Floats) -> dict[str, Any]:
+    """``shape_msgs/Mesh`` of a surface in mm, and its pose."""
+    triangles = [{"vertex_indices": [int(i) for i in face]} for face in mesh.faces]
+    vertices = [_named("xyz", vertex) for vertex in np.round(mesh.vertices * M_PER_MM / GRAIN_M) * GRAIN_M]
+    return {"meshes": [{"triangles": triangles, "vertices": vertices}], "mesh_poses": [pose_message(T)]}
 
 
 def _named(names: str, values: Floats) -> dict[str, float]:

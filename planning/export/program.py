@@ -44,17 +44,12 @@ MOST_SAMPLES = 200_000
 class Program:
     """A URScript program as numbers: mm, rad, s, the controller's base frame."""
 
-    tcp_mm: float
-    """Needle tip in the flange frame, along z."""
+    tcp_mm: float  # needle tip in the flange frame, along z
     start_q: Floats  # shape (6,), as are the other two of the arm's joints
-    moves: tuple[JointMove, ...]
-    """The approach as moves from rest to rest, or empty."""
-    stream_q: Floats
-    """Shape (n, 6), the approach as angles every ``STREAM_S``, or n = 0."""
-    T_base_standoff: Floats
-    """Shape (4, 4), needle tip before the insertion; ``standoff_q`` (6,) the arm there."""
-    T_base_target: Floats
-    """Shape (4, 4), needle tip after it; ``target_q`` (6,) the arm there."""
+    moves: tuple[JointMove, ...]  # the approach as moves from rest to rest, or empty
+    stream_q: Floats  # shape (n, 6), the approach as angles every ``STREAM_S``, or n = 0
+    T_base_standoff: Floats  # shape (4, 4), needle tip before the insertion; ``standoff_q`` (6,) the arm there
+    T_base_target: Floats  # shape (4, 4), needle tip after it; ``target_q`` (6,) the arm there
     standoff_q: Floats  # shape (6,), the arm before the insertion
     target_q: Floats  # shape (6,), the arm after it
     insertion_mm_s: float
@@ -64,24 +59,16 @@ class Program:
 class JointMove(NamedTuple):
     """One ``movej``: a move that is straight in joint angles."""
 
-    q: Floats
-    """Where it ends, shape (6,), rad."""
-    speed: float
-    """Peak speed of the joint that turns farthest, rad/s."""
-    acceleration: float
-    """Peak acceleration of the same joint, rad/s^2."""
-    blend_mm: float
-    """Radius about its end within which the tip may round the corner; 0 stops there."""
+    q: Floats  # where it ends, shape (6,), rad
+    speed: float  # peak speed of the joint that turns farthest, rad/s
+    acceleration: float  # peak acceleration of the same joint, rad/s^2
+    blend_mm: float  # radius about its end within which the tip may round the corner; 0 stops there
 
 
 def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
-    """The program of a plan.
+    """The program of a plan, with a radius for each waypoint between the ends of `waypoint_rows`, shape (k - 2,), or 0.
 
-    Args:
-        blends_mm: Shape (k - 2,), a radius for each waypoint between the ends of :func:`waypoint_rows`; None for 0.
-
-    Raises:
-        InputError: The insertion does not move the tip, or a smooth approach takes too long to stream.
+    Raises InputError: the insertion does not move the tip, or a smooth approach takes too long to stream.
     """
     rows = waypoint_rows(plan)
     between = np.zeros(max(0, len(rows) - 2)) if blends_mm is None else np.asarray(blends_mm, dtype=np.float64)
@@ -123,11 +110,7 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
 
 
 def straight_move(model: UrModel, program: Program) -> Trajectory:
-    """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch.
-
-    Raises:
-        InputError: No branch leads from the standoff to the target.
-    """
+    """The insertion as the controller runs it, straight, on one branch. Raises InputError: none leads to the target."""
     start, end = program.T_base_standoff[:3, 3], program.T_base_target[:3, 3]
     length = float(np.linalg.norm(end - start))
     times, travelled = _trapezoid(length, program.insertion_mm_s, program.insertion_mm_s2)
@@ -196,12 +179,8 @@ def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float
     """Refuse samples that are not the plan's, or that break a limit."""
     for name in SampledMotion._fields:
         read, planned = getattr(motion, name), getattr(plan, name)
-        same = (
-            read.q.shape == planned.q.shape
-            and np.abs(read.q - planned.q).max() <= ANGLE_TOLERANCE_RAD
-            and np.abs(read.times_s - planned.times_s).max() <= TIME_TOLERANCE_S
-        )
-        if not same:
+        same = read.q.shape == planned.q.shape and np.abs(read.q - planned.q).max() <= ANGLE_TOLERANCE_RAD
+        if not (same and np.abs(read.times_s - planned.times_s).max() <= TIME_TOLERANCE_S):
             refuse(f"the {name} does not read back as in the plan", where, "the plan's samples", "not_read_back")
         check_trajectory(plan.model, read, time_resolution_s=time_resolution_s, what=name, where=where)
 
@@ -226,10 +205,8 @@ def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> Non
 
 def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: str, where: Path) -> None:
     """Refuse speeds (m, 6), rad/s, and accelerations (k, 6), rad/s^2, above the limits; NaN is above."""
-    for rates, limits, unit in (
-        (speeds, model.max_speeds, "rad/s"),
-        (accelerations, np.full(6, model.max_acceleration), "rad/s^2"),
-    ):
+    most = np.full(6, model.max_acceleration)
+    for rates, limits, unit in ((speeds, model.max_speeds, "rad/s"), (accelerations, most, "rad/s^2")):
         kept = np.abs(rates) <= limits * (1.0 + RELATIVE_SLACK)
         if not kept.all():
             row, joint = np.argwhere(~kept)[0]
@@ -367,14 +344,10 @@ TURN_TOLERANCE_RAD = 1e-3
 
 def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None, *, where: Path) -> None:
     """Refuse a program that is not the plan's motion, or that breaks a limit."""
-    for name, read, planned in (
-        ("start", program.start_q, plan.approach.q[0]),
-        ("standoff", program.standoff_q, plan.insertion.q[0]),
-        ("target", program.target_q, plan.insertion.q[-1]),
-    ):
-        _check_same(read, planned, f"the {name}", where)
-    wanted = program_of(plan, blends_mm)
-    rates, wanted_rates = _rates(program), _rates(wanted)
+    _check_same(program.start_q, plan.approach.q[0], "the start", where)
+    _check_same(program.standoff_q, plan.insertion.q[0], "the standoff", where)
+    _check_same(program.target_q, plan.insertion.q[-1], "the target", where)
+    rates, wanted_rates = _rates(program), _rates(program_of(plan, blends_mm))
     if len(rates) != len(wanted_rates) or not np.allclose(rates, wanted_rates, rtol=SAME_RATE, atol=0.0):
         what = "a speed, an acceleration or a radius does not read back"
         refuse(what, where, "the plan's, above 1e-6", "not_read_back")
@@ -415,10 +388,8 @@ def _check_approach(program: Program, plan: Plan, where: Path) -> None:
 
 def _check_insertion(program: Program, plan: Plan, where: Path) -> None:
     model, tips = plan.model, tip_poses(plan)
-    for name, read, planned in (
-        ("standoff", program.T_base_standoff, tips[0]),
-        ("target", program.T_base_target, tips[-1]),
-    ):
+    ends = (("standoff", program.T_base_standoff, tips[0]), ("target", program.T_base_target, tips[-1]))
+    for name, read, planned in ends:
         off, angle = _pose_difference(read, planned)
         if not (off <= POSE_TOLERANCE_MM and angle <= TURN_TOLERANCE_RAD):
             refuse(f"the {name} pose is {off:.3g} mm off", where, f"{POSE_TOLERANCE_MM} mm", "not_read_back")
@@ -429,9 +400,9 @@ def _check_insertion(program: Program, plan: Plan, where: Path) -> None:
     if not angle <= TURN_TOLERANCE_RAD:
         refuse(f"the needle rotates by {angle:.3g} rad on its path", where, "a straight path", "not_straight")
     moved = straight_move(model, program)
-    ends = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
-    if not ends <= SAME_BRANCH_RAD:
-        refuse(f"the straight move ends {ends:.3g} rad off", where, "the plan's own branch", "not_read_back")
+    apart = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
+    if not apart <= SAME_BRANCH_RAD:
+        refuse(f"the straight move ends {apart:.3g} rad off", where, "the plan's own branch", "not_read_back")
     line = flange_pose(model, plan.insertion.q)[:, :3, 3]
     unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
     away = np.concatenate([flange_pose(model, moved.q)[:, :3, 3], line]) - line[0]  # both, from one straight line

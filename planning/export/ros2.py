@@ -15,22 +15,18 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 
 NANOSECONDS = 1_000_000_000
-
 LONGEST_S = 2**31 - 1
 """``sec`` is a signed 32-bit integer."""
 TIME_RESOLUTION_S = 1.0 / NANOSECONDS
-
 MONOTONE = 3.0
 """A cubic between two samples stays between them if its end slopes are at most this many times the chord's (Fritsch
 and Carlson, "Monotone piecewise cubic interpolation", 1980)."""
-
 NOTES = (
     "two trajectory_msgs/JointTrajectory: send 'approach', wait for the operator at standoff, then send 'insertion'",
     "joint angles are the same for ROS and for the controller; base_link of ur_description is the controller's base",
     "rotated by 180 deg about z; this matters only for Cartesian poses: there are none here, and frame_id is empty",
     "the arm must be at the first positions before the approach is sent: check it",
 )
-
 _POINT = re.compile(
     r"    - \{positions: \[(.+)\], velocities: \[(.+)\], time_from_start: \{sec: (\d+), nanosec: (\d+)\}\}"
 )
@@ -61,14 +57,11 @@ def _floats(row: Floats) -> str:
 
 
 def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
-    """Speeds at the samples, by differences: 0 at the ends, where the arm rests, and where a joint turns back.
+    """Speeds (m, 6), rad/s, by differences: 0 at the ends, where the arm rests, and where a joint turns back.
 
     Of three parabolas through a sample and two neighbours (both before, one on each side, both after) at least two have
     the motion's own slope when its acceleration changes at samples only, and not at two in a row: the middle one of the
     three slopes is taken. It is kept within what keeps a cubic through the samples between its neighbours.
-
-    Returns:
-        Shape (m, 6), rad/s.
     """
     speeds = np.zeros_like(trajectory.q)
     if len(speeds) < 3:
@@ -93,8 +86,7 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
 def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
     """Read the messages back, line by line as they are written; speeds are compared with the limits.
 
-    Raises:
-        InputError: Any line that is not one of this layout's, other joints, or points that are no motion.
+    Raises InputError: any line that is not one of this layout's, other joints, or points that are no motion.
     """
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     parts: dict[str, Trajectory] = {}

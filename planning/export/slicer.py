@@ -83,9 +83,8 @@ def scene_references(text: str) -> tuple[set[str], set[str]]:
     nodes = list(ElementTree.fromstring(text))
     present = {node.get("id", "") for node in nodes}
     parts = [part for node in nodes for part in node.get("references", "").split(";") if part]
-    return {node.attrib["fileName"] for node in nodes if "fileName" in node.attrib}, {
-        number for part in parts for number in part.partition(":")[2].split() if number not in present
-    }
+    named = {number for part in parts for number in part.partition(":")[2].split()}
+    return {node.attrib["fileName"] for node in nodes if "fileName" in node.attrib}, named - present
 
 
 SLICER = "slicer"
@@ -93,7 +92,6 @@ SLICER = "slicer"
 PATH, MARKERS, AREA = "path.mrk.json", "markers.mrk.json", "safe_entry.vtp"
 TRANSFORM, SCENE = "ct_to_robot.tfm", "scene.mrml"
 NAMES = (PATH, MARKERS, AREA, TRANSFORM, SCENE)
-
 SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     "markups-schema-v1.0.3.json#"
@@ -119,11 +117,7 @@ class SlicerFiles(NamedTuple):
 
 
 def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
-    """The files of a case and a path.
-
-    Raises:
-        InputError: A case in a frame of its own, which Slicer has no name for.
-    """
+    """The files of a case and a path. Raises InputError: a case in a frame of its own, which Slicer has no name for."""
     if case.space is Space.LOCAL:
         refuse('space "local": Slicer knows LPS and RAS', case.path, "a case of a patient", "local_space")
     ends = np.stack([drawn.entry_ct, case.target_ct])
@@ -175,29 +169,14 @@ def _same(read: object, written: object, name: str) -> None:
 
 def markups_text(kind: Literal["Fiducial", "Line"], name: str, labels: Sequence[str], points_ct: Floats) -> str:
     """One markup of points (n, 3), LPS mm, as JSON text; a line has two."""
+    alike = {"orientation": _AXES, "selected": True, "locked": True, "visibility": True, "positionStatus": "defined"}
     points = [
-        {
-            "id": str(number),
-            "label": label,
-            "position": position,
-            "orientation": _AXES,
-            "selected": True,
-            "locked": True,
-            "visibility": True,
-            "positionStatus": "defined",
-        }
+        {"id": str(number), "label": label, "position": position, **alike}
         for number, (label, position) in enumerate(zip(labels, points_ct.tolist(), strict=True), start=1)
     ]
-    markup = {
-        "type": kind,
-        "name": name,
-        "coordinateSystem": "LPS",
-        "coordinateUnits": "mm",
-        "locked": True,
-        "fixedNumberOfControlPoints": True,
-        "labelFormat": "%N-%d",
-        "controlPoints": points,
-    }
+    space = {"coordinateSystem": "LPS", "coordinateUnits": "mm"}
+    fixed = {"locked": True, "fixedNumberOfControlPoints": True, "labelFormat": "%N-%d"}
+    markup = {"type": kind, "name": name, **space, **fixed, "controlPoints": points}
     return json.dumps({"@schema": SCHEMA, "markups": [markup]}, indent=1, ensure_ascii=False) + "\n"
 
 
@@ -209,12 +188,10 @@ STEEPEST = 4.0
 class EntryArea:
     """Triangles on the skin, each between three safe directions of one window."""
 
-    points_ct: Floats
-    """Shape (n, 3), LPS mm: where the paths enter."""
+    points_ct: Floats  # shape (n, 3), LPS mm: where the paths enter
     faces: Ints  # shape (m, 3), indices of points
     window: Ints  # shape (n,), the number of each point's window
-    safe_cone_deg: Floats
-    """Shape (n,), degrees by which each direction may err all round; 0 where nothing is known."""
+    safe_cone_deg: Floats  # shape (n,), degrees by which each direction may err all round; 0 where nothing is known
 
 
 def entry_area(candidates: Candidates) -> EntryArea:

@@ -24,7 +24,6 @@ from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, po
 from puncture_twin.planning.plan.plan import Plan
 
 M_PER_MM = 1e-3
-
 DIGITS = 12
 """After the point: 1e-12 rad and 1e-9 mm. Never an exponent, which not every controller reads."""
 START_TOLERANCE_RAD = 0.002
@@ -32,7 +31,6 @@ START_TOLERANCE_RAD = 0.002
 KINEMATICS_TOLERANCE_RAD = 0.02
 """How far the controller's own joints for the target may be from the plan's: the calibration of one arm moves them by
 some thousandths, another model of the family or another TCP by much more."""
-
 STANDOFF_TOLERANCE_M = 0.002
 """How far the controller may say that the tip is from the standoff: its calibration against the model's lengths."""
 ALIGN_M_S = 0.005
@@ -173,8 +171,7 @@ def _insertion(program: Program, warnings: Sequence[str]) -> list[str]:
 def read_urscript(text: str, *, where: Path) -> Program:
     """Read a program back, as it is written here.
 
-    Raises:
-        InputError: A value or a move is missing or stands twice, or the insertion does not wait for the operator.
+    Raises InputError: a value or a move is missing or stands twice, or the insertion does not wait for the operator.
     """
     lines = text.splitlines()
     values = {match[1]: _floats(match[2]) for line in lines if (match := _VALUE.fullmatch(line))}

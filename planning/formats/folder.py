@@ -84,12 +84,9 @@ def _what(one: os.DirEntry[str]) -> str:
 
 
 def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], bool], depth: int = 0) -> list[Entry]:
-    """The entries of a folder that are neither known nor harmless.
+    """The entries of a folder that are neither known (read, by whoever asks or someone else) nor harmless.
 
     A folder in it is accounted for if it is passed over, or if all that it holds is accounted for.
-
-    Args:
-        known: Whether a path is read, by whoever asks or by someone else.
     """
     names = {one.name for one in found}
     return [

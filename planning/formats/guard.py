@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.arrays import any_masked, is_frozen
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.base.text import check_name
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
@@ -88,10 +88,8 @@ def guard_points(points: Many, names: Sequence[str], *, where: str | Path) -> ND
 
 
 def _float_array(values: Many, *, what: str, where: str | Path, allowed: str) -> NDArray[np.float64]:
-    try:
+    with refusing(ValueError, f"{what} is ragged", where, allowed, "wrong_shape"):  # rows of different length
         raw = np.asarray(values)
-    except ValueError as error:  # what numpy raises for rows of different length
-        raise InputError(f"{what} is ragged ({error})", where=where, allowed=allowed, code="wrong_shape") from error
     if raw.dtype.kind not in "iuf":
         refuse(f"{what} has values of type {raw.dtype}", where, allowed, "wrong_type")
     if any_masked(values):
@@ -132,17 +130,11 @@ _EXTENT_ALLOWED = (
 
 
 def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> TriangleMesh:
-    """Check a mesh: finite, indices in range, of a plausible size, with an area; and return it.
+    """A checked mesh of vertices (n, 3), mm, any frame, and faces (m, 3).
 
-    Triangles of zero area are all kept: their corners still belong to the surface, and dropping them would
-    change counts; ``mesh_files.mesh_warnings`` counts them. Only a mesh without any area is refused.
-    Vertices that no triangle uses are left out, after they were checked like the others, so that the bounds
-    are those of the surface; the order of the rest, and of the triangles, stays.
-
-    Args:
-        vertices: Shape (n, 3), mm, any frame.
-        faces: Shape (m, 3), whole numbers, indices into ``vertices``.
-        where: The file and the place in it, for the error.
+    Triangles of zero area are kept: their corners belong to the surface. Vertices that no triangle uses are left out,
+    after they were checked like the others; the order of the rest, and of the triangles, stays. Raises InputError: not
+    finite, an index out of range, an implausible size, or no area at all.
     """
     points = points_array(vertices, [], what="vertex", where=where)
     indices = _index_array(faces, len(points), where=where)
@@ -177,10 +169,8 @@ def fits(mesh: TriangleMesh) -> bool:
 
 def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDArray[np.int32]:
     allowed = f"three whole numbers from 0 to {n_vertices - 1} per triangle, 1 to {MAX_TRIANGLES} triangles"
-    try:
+    with refusing(ValueError, "face list is ragged", where, allowed, "wrong_shape"):
         raw = np.asarray(faces)
-    except ValueError as error:  # what numpy raises for rows of different length
-        raise InputError(f"face list is ragged ({error})", where=where, allowed=allowed, code="wrong_shape") from error
     if raw.size == 0:
         refuse("no triangle", where, allowed, "empty")
     if raw.ndim != 2 or raw.shape[1] != 3:
@@ -228,12 +218,8 @@ def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
 def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: str) -> NDArray[np.int64]:
     """Triangles (m, 3) of polygons: each a fan from its first corner, which is exact for convex ones.
 
-    Args:
-        corners: Shape (k,), the vertex indices of all polygons, one after the other.
-        counts: Shape (p,), how many of them each polygon has; they sum to k.
-
-    Raises:
-        InputError: If a polygon has fewer than three corners, or the triangles are too many.
+    Of the vertex indices of all polygons, one after the other, shape (k,), and how many each has, shape (p,), in all k.
+    Raises InputError: a polygon of fewer than three corners, or too many triangles.
     """
     if len(counts) == 0:
         refuse("no face", where, "at least one triangle", "empty")

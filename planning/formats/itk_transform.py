@@ -46,20 +46,17 @@ def most_bytes(name: str) -> int:
 def parse_transform(data: bytes, path: Path) -> Floats:
     """The rigid motion of points (4, 4), mm, that a file states. Raises InputError: another, several, or not rigid."""
     name = str(path)
-    if name.lower().endswith(HDF5_ENDINGS):
-        stated = hdf5_transforms(data, name)
-    elif name.lower().endswith(TEXT_ENDINGS):
-        lines = [line.strip() for line in _LINE_END.split(decode_text(data, name)) if line.strip()]
-        if not lines or lines[0] != _HEADER:
-            refuse("not an ITK transform file", name, ALLOWED, "wrong_format")
-        stated = _text_transforms(lines, name)
-    else:
+    if not name.lower().endswith(HDF5_ENDINGS + TEXT_ENDINGS):
         refuse(f"transform file of the kind {path.suffix!r}", path, ALLOWED, "unknown_format")
-    return guard_transform(linear_motion(stated, name), where=path)
+    read = hdf5_transforms if name.lower().endswith(HDF5_ENDINGS) else _text_transforms
+    return guard_transform(linear_motion(read(data, name), name), where=path)
 
 
-def _text_transforms(lines: list[str], where: str) -> list[StatedTransform]:
+def _text_transforms(data: bytes, where: str) -> list[StatedTransform]:
     """The transforms of a text in its order; a key that is not stated has no numbers."""
+    lines = [line.strip() for line in _LINE_END.split(decode_text(data, where)) if line.strip()]
+    if not lines or lines[0] != _HEADER:
+        refuse("not an ITK transform file", where, ALLOWED, "wrong_format")
     blocks: list[tuple[str, dict[str, str]]] = []
     for line in lines:
         key, mark, value = (part.strip() for part in line.partition(":"))
@@ -89,10 +86,8 @@ def transform_text(T: Floats) -> str:
     Transform: AffineTransform_double_3_3
     """
     numbers = " ".join(map(repr, [*T[:3, :3].ravel().tolist(), *T[:3, 3].tolist()]))
-    return (
-        f"{_HEADER}\n#Transform 0\nTransform: AffineTransform_double_3_3\nParameters: {numbers}\n"
-        "FixedParameters: 0 0 0\n"
-    )
+    head = f"{_HEADER}\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
+    return f"{head}Parameters: {numbers}\nFixedParameters: 0 0 0\n"
 
 
 MAX_PARTS = 20
@@ -129,12 +124,12 @@ def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
     parts = stated[1:] if stated and _COMPOSITE.fullmatch(stated[0].kind) else stated
     if not parts:
         refuse("not a linear transform", where, ALLOWED, "no_linear_transform")
-    T = np.eye(4)
     for part in parts:
         if _LINEAR.fullmatch(part.kind) is None:
             refuse(f"transform of type {part.kind[:60]!r}", where, ALLOWED, "unknown_type")
     if len(parts) > 1 and parts is stated:
         refuse("several transforms: harden them into one", where, ALLOWED, "several_transforms")
+    T = np.eye(4)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by the guard
         for part in parts:
             T = T @ _motion(part, where)
@@ -177,8 +172,7 @@ def _versor(v: Floats, where: str) -> Floats:
         v = v / (length * (1.0 + _VERSOR_EDGE))
     (x, y, z), w = v, np.sqrt(1.0 - v @ v)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    R: Floats = np.eye(3) + 2.0 * (w * cross + cross @ cross)
-    return R
+    return np.asarray(np.eye(3) + 2.0 * (w * cross + cross @ cross))
 
 
 MAX_STORED_BYTES = 4096
@@ -277,9 +271,7 @@ def _numbered(parent: Collection[str], where: str) -> list[str]:
 def heap_text(content: bytes, offset: int | None) -> str:
     """A text of variable length, from the collection of the global heap that holds it.
 
-    Args:
-        offset: Where the element stands: length (4 bytes), the collection's address (8), the object's number (4).
-
+    At ``offset`` are its length (4 bytes), the collection's address (8) and the object's number (4).
     Source: HDF5 file format, version 3, III.E "Disk format: global heap", IV.B "variable-length datatypes".
     """
     if offset is None:

@@ -2,8 +2,7 @@
 
 A CSV states its unit in the header (``name,x_mm,y_mm,z_mm``) and leaves the space to the case; Slicer's files state
 both. Whatever states a patient space arrives in LPS, in mm. Source: Slicer documentation, "Markups" module, file
-formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the coordinate system is a number. Version
-1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
+formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the coordinate system is a number.
 `joint_readings` is the one gate for joint angles: whose arm they are of is checked in `planning/arm/kinematics.py`.
 """
 
@@ -22,8 +21,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.arrays import Floats, read_only
+from puncture_twin.planning.base.errors import InputError, refuse, refusing
 from puncture_twin.planning.base.files import atomic, decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import Facts, Shown, brief
@@ -59,9 +58,7 @@ class NamedPoints(Shown):
     def __post_init__(self) -> None:
         for name in ("points", "joints"):
             if getattr(self, name) is not None:
-                array = np.array(getattr(self, name), dtype=np.float64)
-                array.setflags(write=False)
-                object.__setattr__(self, name, array)
+                object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 MAX_FILE_BYTES = 10_000_000
@@ -73,9 +70,7 @@ MOST_NAMED = 8
 def read_points(path: Path, *, default_space: Space | None = None, default_unit: Unit | None = None) -> NamedPoints:
     """The points of one file, in mm; in LPS where the file or the caller names a patient space.
 
-    Args:
-        default_space: The space of a file that states none: the case's, or None for a robot's base.
-        default_unit: The unit of a file that states none; None refuses such a file.
+    The defaults are of a file that states none: the case's space, or None for a robot's base; no unit refuses the file.
     """
     _reader(path, str(path))  # an unknown ending is refused before anything is read
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
@@ -99,9 +94,8 @@ def parse_points(
     with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
         points = points * unit.mm if space is None else to_lps(points, space) * unit.mm
     guarded = guard_points(points, raw.names, where=name)
-    joints = None
-    if raw.joints_deg is not None:
-        joints = joint_readings(raw.joints_deg, "deg", where=name, names=raw.names)
+    stated = raw.joints_deg
+    joints = None if stated is None else joint_readings(stated, "deg", where=name, names=raw.names)
     return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds, joints)
 
 
@@ -113,14 +107,9 @@ def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
 
 
 def write_points(path: Path, points: NamedPoints) -> None:
-    """Write a CSV ``name,x_mm,y_mm,z_mm`` and joints, whole, in the space of its case; it reads back the same.
-
-    Raises:
-        InputError: If the place cannot be written to.
-    """
-    joints = points.joints is not None
+    """Write a CSV ``name,x_mm,y_mm,z_mm`` and joints, whole, in its case's space. Raises InputError: no such place."""
     header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
-    header += JOINTS_DEG if joints else []
+    header += [] if points.joints is None else JOINTS_DEG
     labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
     numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
     rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
@@ -144,8 +133,7 @@ class RawPoints(NamedTuple):
     unit: Unit | None  # None if the file states none
     space: Space | None  # None if the file states none
     kinds: tuple[str, ...] | None = None  # one per point, if the file has them
-    # six joint angles per point, if the file says how the robot stood there
-    joints_deg: list[tuple[float, ...]] | None = None
+    joints_deg: list[tuple[float, ...]] | None = None  # six angles per point, if it says how the robot stood there
 
 
 def parse_coordinate(text: str, where: str) -> float:
@@ -195,8 +183,7 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
         refuse(f"columns {header}", f"{where}, header", _ALLOWED, "wrong_columns")
     if len(set(units.values())) != 1:
         refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED, "mixed_units")
-    text = units["x"]
-    unit = parse_unit(text, where=f"{where}, header") if text else None
+    unit = parse_unit(units["x"], where=f"{where}, header") if units["x"] else None
     columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
     placed = [(f"{where}, line {line}", fields) for line, fields in rows[1:]]
     for place, fields in placed:
@@ -334,26 +321,17 @@ _ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actu
 class JointRecording(NamedTuple):
     """Rows of a recording of joints."""
 
-    names: tuple[str, ...]
-    """Names of the rows, or their numbers."""
-    q: Floats
-    """Shape (n, 6), rad."""
-    time_s: Floats | None
-    """Shape (n,); None where the file has no times."""
-    tool_base: Floats | None
-    """Where the controller had its tool, shape (n, 3), mm; None where the file does not say it."""
-    torque_nm: Floats | None = None
-    """Shape (n, 6); None where the file has no torques."""
+    names: tuple[str, ...]  # names of the rows, or their numbers
+    q: Floats  # shape (n, 6), rad
+    time_s: Floats | None  # shape (n,); None where the file has no times
+    tool_base: Floats | None  # where the controller had its tool, shape (n, 3), mm; None where the file does not say it
+    torque_nm: Floats | None = None  # shape (n, 6); None where the file has no torques
 
 
 def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, names: Sequence[str] = ()) -> Floats:
-    """Joint angles that an arm can have, shape (n, 6), rad.
+    """Joint angles that an arm can have, shape (n, 6), rad; of ``values`` (n, 6), in the unit.
 
-    Args:
-        values: Shape (n, 6), in the unit.
-
-    Raises:
-        InputError: Not six finite angles each, beyond what a joint can read, or plainly in the other unit.
+    Raises InputError: not six finite angles each, beyond what a joint can read, or plainly in the other unit.
     """
     given = np.asarray(values)
     if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != 6 or not np.isfinite(given).all():
@@ -364,13 +342,10 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
     if beyond.any():
         row, joint = (int(i) for i in np.argwhere(beyond)[0])
         name = names[row] if row < len(names) else f"row {row + 1}"
-        likely = (
-            unit == "rad" and np.abs(given).max() > 2 * WHOLE_TURN and (np.abs(given) <= np.degrees(MOST_RAD)).all()
-        )
-        guess = ": degrees?" if likely else ""
+        degrees = np.abs(given).max() > 2 * WHOLE_TURN and (np.abs(given) <= np.degrees(MOST_RAD)).all()
+        guess = ": degrees?" if unit == "rad" and degrees else ""
         what = f"joint {joint + 1} of {name} at {given[row, joint]:g} {unit}, beyond its range{guess}"
-        limits = "363 degrees (6.34 rad) either way; wrist 3: two turns"
-        refuse(what, where, limits, "joints_beyond")
+        refuse(what, where, "363 degrees (6.34 rad) either way; wrist 3: two turns", "joints_beyond")
     if unit == "deg" and plainly_radians(given):
         what = f"every joint is within {np.abs(given).max():.3g} degrees of zero: in radians?"
         refuse(what, where, "degrees, as in the names of the columns", "joints_unit")
@@ -379,30 +354,21 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
 
 def plainly_radians(angles_deg: ArrayLike) -> bool:
     """Whether angles of an arm's joints, stated as degrees, are radians: none beyond 2 pi, and not all zero."""
-    most = float(np.abs(np.asarray(angles_deg, dtype=np.float64)).max(initial=0.0))
-    return 0.0 < most <= WHOLE_TURN
+    return 0.0 < float(np.abs(np.asarray(angles_deg, dtype=np.float64)).max(initial=0.0)) <= WHOLE_TURN
 
 
 def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecording:
     """The joints of a CSV: a header, then a row a pose; other columns and lines with # do not count.
 
-    Separated by commas, or by spaces as RTDE's own client writes it.
-
-    Args:
-        timed: Whether it must hold times.
-
-    Raises:
-        InputError: A column is missing, something is no number, or the angles or times are of no arm.
+    Separated by commas, or by spaces as RTDE's own client writes it. ``timed``: whether it must hold times.
+    Raises InputError: a column is missing, something is no number, or the angles or times are of no arm.
     """
     lines = [line for line in decode_text(data, str(path)).splitlines() if line.strip() and not line.startswith("#")]
     comma = bool(lines) and "," in lines[0]
-    try:
+    with refusing(csv.Error, "is not a CSV file", path, _ALLOWED_JOINTS, "not_csv"):
         rows = list(csv.reader(lines, strict=True)) if comma else [line.split() for line in lines]
-    except csv.Error as error:
-        raise InputError(f"is not a CSV file ({error})", where=path, allowed=_ALLOWED_JOINTS, code="not_csv") from error
     header = [cell.strip().strip('"') for cell in rows[0]] if rows else []
-    kinds: list[tuple[tuple[str, ...], AngleUnit]]
-    kinds = [(JOINTS_RAD, "rad"), (JOINTS_DEG, "deg"), (RTDE_JOINTS, "rad")]
+    kinds: list[tuple[tuple[str, ...], AngleUnit]] = [(JOINTS_RAD, "rad"), (JOINTS_DEG, "deg"), (RTDE_JOINTS, "rad")]
     joints, unit = max(kinds, key=lambda kind: sum(name in header for name in kind[0]))
     missing = [name for name in joints if name not in header]
     if missing:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points import csv_lines, row_numbers
@@ -29,10 +29,8 @@ class GroupedTable(NamedTuple):
     """The rows of a table."""
 
     names: tuple[str, ...]
-    numbers: Mapping[str, Floats]
-    """Shape (n, k) of each group that is there."""
-    texts: Mapping[str, tuple[str, ...]]
-    """Of each column of text that is there."""
+    numbers: Mapping[str, Floats]  # shape (n, k) of each group that is there
+    texts: Mapping[str, tuple[str, ...]]  # of each column of text that is there
 
 
 def parse_table(
@@ -45,16 +43,13 @@ def parse_table(
     first: str = "name",
     texts: frozenset[str] = frozenset(),
 ) -> GroupedTable:
-    """The rows of a table that has been read.
+    """The rows of a table. Raises InputError: another header, no row, one of another length, or no finite number.
 
     Args:
         groups: Columns that it may have behind the first one.
         fits: Whether the groups that are there belong together.
         example: Groups of a usual file, for the error.
         texts: Groups of one column that is text.
-
-    Raises:
-        InputError: Another header, no row, a row of another length, or a field that is no finite number.
     """
     allowed = ", ".join((first, *(column for group in example for column in groups[group])))
     lines = [one for one in csv_lines(content, str(path), allowed) if not one.fields[0].startswith("#")]
@@ -70,15 +65,12 @@ def parse_table(
     rows = [row_numbers(fields, header, wanted, f"{path}, line {line}") for line, fields in lines[1:]]
     if not rows:
         refuse("no row", path, "one row or more", "empty")
-    ends = np.cumsum([len(groups[group]) for group in found if group not in texts])[:-1]
-    parts = np.split(np.array(rows), ends, axis=1)
-    plain = (group for group in found if group not in texts)
+    plain = [group for group in found if group not in texts]
+    parts = np.split(np.array(rows), np.cumsum([len(groups[group]) for group in plain])[:-1], axis=1)
     words = {group: header.index(groups[group][0]) for group in found if group in texts}
-    return GroupedTable(
-        tuple(fields[0].strip() for _, fields in lines[1:]),
-        dict(zip(plain, parts, strict=True)),
-        {group: tuple(fields[at].strip() for _, fields in lines[1:]) for group, at in words.items()},
-    )
+    names = tuple(fields[0].strip() for _, fields in lines[1:])
+    said = {group: tuple(fields[at].strip() for _, fields in lines[1:]) for group, at in words.items()}
+    return GroupedTable(names, dict(zip(plain, parts, strict=True)), said)
 
 
 def table_text(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -104,25 +96,20 @@ def pose_values(T: Floats) -> Floats:
 
 
 def finite_rows(values: Floats, what: str, names: Sequence[str], *, widths: tuple[int, ...]) -> Floats:
-    """A read-only copy of an array with a row per pose, shape (n, k), k one of ``widths``, all finite and in range.
-
-    Raises:
-        InputError: Another shape, or a number that is not finite or out of range; names the pose.
-    """
-    array = np.array(values, dtype=np.float64)
+    """A read-only copy of rows (n, k), k one of ``widths``. Raises InputError: another shape, or out of range."""
+    array = read_only(values)
     if array.ndim != 2 or len(array) != len(names) or array.shape[1] not in widths:
         wanted = " or ".join(f"({len(names)}, {width})" for width in widths)
         refuse(f"{what} has shape {array.shape}", "recording", wanted, "wrong_shape")
     bad = np.asarray(~(np.isfinite(array) & (np.abs(array) <= MAX_COORDINATE_MM)).all(axis=1))
     allowed = f"numbers within {MAX_COORDINATE_MM:g}"
     refuse_first(bad, names, what, "is not finite or out of range", allowed, "not_finite")
-    array.setflags(write=False)
     return array
 
 
 def rigid_poses(T: Floats, what: str, names: Sequence[str]) -> Floats:
     """A read-only copy of poses (n, 4, 4). Raises InputError: another shape, or one that is no rigid motion."""
-    array = np.array(T, dtype=np.float64)
+    array = read_only(T)
     if array.shape != (len(names), 4, 4):
         refuse(f"{what} has shape {array.shape}", "recording", f"({len(names)}, 4, 4)", "wrong_shape")
     finite_rows(array.reshape(len(names), 16), what, names, widths=(16,))
@@ -131,7 +118,6 @@ def rigid_poses(T: Floats, what: str, names: Sequence[str]) -> Floats:
     bad = (error > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0) | (np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1) > 0)
     allowed = f"a rotation (R^T R = 1 to {ROTATION_TOLERANCE:g}, determinant +1) and a translation, last row 0 0 0 1"
     refuse_first(bad, names, what, "is not a rigid motion", allowed, "not_rigid")
-    array.setflags(write=False)
     return array
 
 

@@ -163,5 +163,4 @@ def with_image_seen(text: str, anatomy: Anatomy) -> str:
 
 def case_name(folder: str) -> str:
     """A folder's name as a case may be called."""
-    plain = re.sub(r"[^\w.\-]+", "_", unicodedata.normalize("NFC", folder)).strip("_.-")[:80]
-    return plain or "case"
+    return re.sub(r"[^\w.\-]+", "_", unicodedata.normalize("NFC", folder)).strip("_.-")[:80] or "case"

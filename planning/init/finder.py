@@ -14,19 +14,10 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import counts_of
 from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.formats import folder as folders
 from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
-from puncture_twin.planning.formats.folder import (
-    FILE,
-    FOLDER,
-    NOT_READ,
-    STRUCTURE_LIKE,
-    Entry,
-    entries,
-    is_passed_over,
-    structure_below,
-    unaccounted,
-)
+from puncture_twin.planning.formats.folder import FILE, FOLDER, NOT_READ, STRUCTURE_LIKE, Entry, entries, unaccounted
 from puncture_twin.planning.formats.labels.label_sources import (
     MASK_ENDINGS,
     SEGMENT_ENDING,
@@ -35,13 +26,14 @@ from puncture_twin.planning.formats.labels.label_sources import (
     structure_name,
 )
 from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, labelmap_of, whole_labels
+from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES
 from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 from puncture_twin.planning.init.label_files import Mask, file_masks, is_named_by_table, label_file, mask_of, masks_of
 from puncture_twin.planning.init.overrides import Overrides
-from puncture_twin.planning.init.segmentation import Place, Segmentation, is_mesh, mesh_folder
+from puncture_twin.planning.init.segmentation import Place, Segmentation, mesh_folder
 
 DEPTH = 2
 """Levels of folders below the one that is given."""
@@ -132,7 +124,7 @@ def _folders(folder: Path, depth: int) -> Iterator[tuple[Path, tuple[Entry, ...]
     allowed = f"a readable folder of one patient, with up to {MOST_ENTRIES} files"
     listed = entries(folder, most=MOST_ENTRIES, allowed=allowed)
     below = [folder / one.name for one in listed if one.what == FOLDER] if depth > 0 else []
-    entered = [one for one in below if not is_passed_over(one)]
+    entered = [one for one in below if not folders.is_passed_over(one)]
     yield folder, listed, frozenset(one.name for one in entered)
     for one in entered:
         yield from _folders(one, depth - 1)
@@ -142,8 +134,7 @@ class _Looker:
     """Asks each kind's recogniser about one folder."""
 
     def __init__(self, place: Place, wanted: Wanted, folder: Path, listed: tuple[Entry, ...], found: Found) -> None:
-        self._place, self._wanted, self._found = place, wanted, found
-        self._folder, self._listed = folder, listed
+        self._place, self._wanted, self._found, self._folder, self._listed = place, wanted, found, folder, listed
         self._source = folder.relative_to(place.folder).as_posix()
         self._names = [self._name(one.name) for one in listed if one.what == FILE]
         self._read: set[str] = set()
@@ -157,7 +148,7 @@ class _Looker:
         """DICOM, volumes, meshes, points; and what is none of these."""
         self._dicom()
         volumes = [name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)]
-        meshes = [name for name in self._names if is_mesh(name)]
+        meshes = [name for name in self._names if name.lower().endswith(MESH_SUFFIXES)]
         named = (self._name(one) for one in entered if not self._hollow(one))
         self._read.update(volumes, meshes, named, self._left_out)
         self._found.passed += [(name, LEFT_OUT) for name in self._left_out]
@@ -201,7 +192,11 @@ class _Looker:
         lost: dict[str, Entry] = {}
         for one in left:
             if self._wanted.takes("labels", self._name(one.name)):
-                if not self._only and one.what == FOLDER and (below := structure_below(self._folder / one.name)):
+                if (
+                    not self._only
+                    and one.what == FOLDER
+                    and (below := folders.structure_below(self._folder / one.name))
+                ):
                     lost[one.name] = one._replace(what=f"is nested too deep to search, with {below}")
                 elif self._only or STRUCTURE_LIKE.search(one.name):
                     lost[one.name] = one
@@ -302,8 +297,7 @@ class _Looker:
 def volume_kind(volume: Volume) -> tuple[str, str]:
     """A volume's kind: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``, and why.
 
-    Raises:
-        InputError: A label map that was blended by an interpolation.
+    Raises InputError: a label map that was blended by an interpolation.
     """
     low, high = float(volume.values.min()), float(volume.values.max())
     if low <= AIR_HU:

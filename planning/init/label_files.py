@@ -28,16 +28,8 @@ from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, Box, L
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.init.segmentation import (
-    Assigned,
-    Place,
-    Segmentation,
-    in_boxes,
-    margin_line,
-    quoted,
-    rules_text,
-    skin_text,
-)
+from puncture_twin.planning.init import segmentation
+from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation, label_text, quoted, rules_text
 
 NUMBERING_FOUND = "{source}: numbered as {naming}, inferred from the positions of its organs"
 NUMBERING_UNSURE = (
@@ -61,17 +53,12 @@ def masks_of(
     masks = dict(enumerate(found, start=1))
 
     def single(row: Assigned) -> str:
-        mask = masks[row.label]
-        return (
-            f"[[structure]]\nname = {quoted(row.name)}\nlabelmap = {quoted(mask.file)}\nlabel = {mask.label}\n"
-            f'role = "{row.kind}"\n{margin_line(row)}'
-        )
+        return label_text(row, masks[row.label].file, masks[row.label].label)
 
     def section(rows: Sequence[Assigned]) -> str:
         if not whole_folder:
             return "\n".join(single(row) for row in rows if row.kind != "ignore")
-        own = ((row.name, masks[row.label]) for row in rows if row.kind == "skin")
-        skins = (skin_text(name, mask.file, mask.label) for name, mask in own)
+        skins = (f"\n{single(row)}" for row in rows if row.kind == "skin")
         return f"[[structures]]\nmasks = {quoted(source)}\n{rules_text(rows)}{''.join(skins)}"
 
     return Segmentation(
@@ -94,20 +81,13 @@ def in_box(point_ct: Floats, box: Box, T_ct_index: Floats) -> bool:
 
 def mask_of(file: str, labels: LabelMap) -> Mask | None:
     """The mask in a file; None for an empty one."""
-    if not labels.boxes:
-        return None
-    ((label, box),) = labels.boxes.items()
-    return Mask(file, label, box, labels.T_ct_index)
+    return next((Mask(file, label, box, labels.T_ct_index) for label, box in labels.boxes.items()), None)
 
 
 def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str | None) -> Segmentation:
-    """A label map with the names of its labels: stated, inside the file, in a table beside it, or TotalSegmentator's.
+    """A label map with names: stated as ``naming``, inside the file, in a table beside it, or TotalSegmentator's.
 
-    Args:
-        naming: As the user states it, or None.
-
-    Raises:
-        InputError: No names are found, or they do not name every label.
+    Raises InputError: no names are found, or they do not name every label.
     """
     present = surfaces.present().labels
     if naming is None and surfaces.names is None:
@@ -115,11 +95,9 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
     else:
         notes = ()
     named = names_for(naming, place.folder, lambda name: _table(place.folder / name), surfaces)
-    missing = [label for label in present if label not in named]
-    if missing:
-        shown = ", ".join(map(str, missing[:10]))
-        allowed = "--naming with a name for each label"
-        refuse(f"labels without a name: {shown}", place.folder / source, allowed, "labels_without_names")
+    if missing := [label for label in present if label not in named]:
+        what = f"labels without a name: {', '.join(map(str, missing[:10]))}"
+        refuse(what, place.folder / source, "--naming with a name for each label", "labels_without_names")
     stated = "" if naming is None else f"naming = {quoted(naming)}\n"
 
     def near(point_ct: Floats) -> tuple[int, ...]:
@@ -127,7 +105,7 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
         return tuple(label for label, box in labels.boxes.items() if in_box(point_ct, box, labels.T_ct_index))
 
     def section(rows: Sequence[Assigned]) -> str:
-        skins = (skin_text(row.name, source, row.label) for row in rows if row.kind == "skin")
+        skins = (f"\n{label_text(row, source, row.label)}" for row in rows if row.kind == "skin")
         return f"[[structures]]\nlabelmap = {quoted(source)}\n{stated}{rules_text(rows)}{''.join(skins)}"
 
     return Segmentation(
@@ -158,12 +136,8 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
 def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool:
     """Whether a table beside a map of one label names that: not one with the file's own name in it.
 
-    Args:
-        label: The only one in it.
-        only: Whether no other map or mask lies beside it, so that the table may have any name.
-
-    Raises:
-        InputError: It is one organ by the file's name, and another by a table of another name.
+    ``only``: whether no other map or mask lies beside it, so that the table may have any name. Raises InputError: it is
+    one organ by the file's name, and another by a table of another name.
     """
     tables = [one for one in _tables_beside(place.folder, source) if only or _is_named_like(one, source)]
     table, _ = _one_table(place, source, [label], tables)
@@ -228,12 +202,8 @@ def _table(path: Path) -> bytes:
 def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentation:
     """The structures of a file: of DICOM on the slices of the CT, or segments of Slicer, of which some overlap.
 
-    Args:
-        key: Of the case: ``seg`` or ``rtstruct``.
-        ct: The CT of the case, read before, or None.
-
-    Raises:
-        InputError: Structures that cannot be trusted, or were drawn on another CT.
+    ``key`` of the case: ``seg`` or ``rtstruct``; ``ct`` was read before, or is None. Raises InputError: they cannot be
+    trusted, or were drawn on another CT.
     """
     place.content(source)
     place.volumes.read_masks(StructuresSection.model_validate({key: source}), ct)
@@ -252,7 +222,7 @@ def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentat
     return Segmentation(
         source,
         names,
-        near=lambda point_ct: in_boxes({label: surface(label).bounds for label in names}, point_ct),
+        near=lambda point_ct: segmentation.in_boxes({label: surface(label).bounds for label in names}, point_ct),
         surface=surface,
         skin=skin,
         section=lambda rows: f"[[structures]]\n{key} = {quoted(source)}\n{rules_text(rows)}",

@@ -57,8 +57,7 @@ class Overrides:
 def overrides_of(skin: str | None, ignore: Iterable[str], unknown: Iterable[str], settings: Iterable[str]) -> Overrides:
     """The options as they were typed; a value that is no TOML is a text, so that ``ct.arms=none`` needs no quotes.
 
-    Raises:
-        InputError: No ``KEY=VALUE``, a key that has an option of its own or is no key of a table.
+    Raises InputError: no ``KEY=VALUE``, a key that has an option of its own or is no key of a table.
     """
     keys = {}
     for text in settings:

@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, UP_NOT_STATED, mesh_extent, read_mesh
+from puncture_twin.planning.formats.meshes.mesh_files import UP_NOT_STATED, mesh_extent, read_mesh
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
@@ -116,10 +116,16 @@ def margin_line(row: Assigned) -> str:
     return reason + (change if row.kind == "unknown" and row.line not in {NOT_ANNOTATED, STATED} else "")
 
 
+def structure_text(row: Assigned, source: str, more: str = "") -> str:
+    """The ``[[structure]]`` of one with a source of its own: lines that name that, and lines behind its margin."""
+    head = f"[[structure]]\nname = {quoted(row.name)}\n{source}"
+    return f'{head}role = "{row.kind}"\n{margin_line(row)}{more}'
+
+
 def rules_text(rows: Sequence[Assigned]) -> str:
     """The lists and the table of a ``[[structures]]``: each structure by its own name, with the reason of its line.
 
-    The skin is ignored among them: a ``[[structure]]`` of its own, `skin_text`, says what it is.
+    The skin is ignored among them: a ``[[structure]]`` of its own, `label_text`, says what it is.
     """
     parts = []
     for kind in ("target", "traverse", "ignore"):
@@ -137,9 +143,9 @@ def rules_text(rows: Sequence[Assigned]) -> str:
     return "".join(parts)
 
 
-def skin_text(name: str, file: str, label: int) -> str:
-    """The ``[[structure]]`` of a label that is the skin."""
-    return f'\n[[structure]]\nname = {quoted(name)}\nlabelmap = {quoted(file)}\nlabel = {label}\nrole = "skin"\n'
+def label_text(row: Assigned, file: str, label: int) -> str:
+    """The ``[[structure]]`` of a label of a map."""
+    return structure_text(row, f"labelmap = {quoted(file)}\nlabel = {label}\n")
 
 
 LEAST_EXTENT = ((Unit.MM, 130.0), (Unit.CM, 5.0), (Unit.M, 0.0))
@@ -163,10 +169,9 @@ def mesh_folder(
 ) -> Segmentation:
     """The meshes of a folder, in the unit that their extent tells where none is stated; of GLB ``up`` must be.
 
-    Raises:
-        InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
+    Raises InputError: a mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
-    if len({mesh_name(one) for one in names}) < len(names):
+    if len(set(map(mesh_name, names))) < len(names):
         refuse("two meshes have the same name", place.folder / source, "one mesh per structure", "duplicate_name")
     if up is None and any(name.lower().endswith(".glb") for name in names):
         what = f"GLB: {UP_NOT_STATED} (--up y rotates them to z up, --up z keeps them)"
@@ -187,23 +192,18 @@ def mesh_folder(
         f"together {diagonal * unit.mm:.0f} mm from corner to corner; mesh files do not state their unit"
     )
     files = dict(enumerate(sorted(names), start=1))
+    read = partial(read_mesh, unit=unit, space=space, space_is_default=True, up=up)
 
     @cache
     def meshes() -> Mapping[int, TriangleMesh]:
-        return {
-            number: read_mesh(place.folder / file, unit=unit, space=space, space_is_default=True, up=up)
-            for number, file in files.items()
-        }
+        return {number: read(place.folder / file) for number, file in files.items()}
 
     def single(row: Assigned) -> str:
         ends = flat_ends(meshes()[row.label]) if row.kind == "skin" else ()
         listed = ", ".join(map(quoted, ends))
         cut = f"cut = [{listed}]  # flat there: the scan ended; [] if all of it is skin\n" if ends else ""
         turned = "" if up is None else f'up = "{up}"\n'
-        return (
-            f"[[structure]]\nname = {quoted(row.name)}\nmesh = {quoted(files[row.label])}\n"
-            f'unit = "{unit}"\n{turned}role = "{row.kind}"\n{margin_line(row)}{cut}'
-        )
+        return structure_text(row, f'mesh = {quoted(files[row.label])}\nunit = "{unit}"\n{turned}', cut)
 
     return Segmentation(
         source,
@@ -214,11 +214,6 @@ def mesh_folder(
         section=lambda rows: "\n".join(single(row) for row in rows if row.kind != "ignore"),
         notes=(said,),
     )
-
-
-def is_mesh(name: str) -> bool:
-    """Whether a file's ending is that of a mesh."""
-    return name.lower().endswith(MESH_SUFFIXES)
 
 
 NEAR_MM, NEAR = 8.0, 0.02
@@ -279,10 +274,8 @@ def skin_problems(found: Structure, segmentations: Sequence[Segmentation]) -> It
 class Agreement(NamedTuple):
     """How far a structure is the body's outline."""
 
-    skin_covered: float
-    """Of the skin, the fraction that it is near to; faces where the scan cut the body do not count."""
-    on_skin: float
-    """Of its own surface, the fraction that is near to the skin."""
+    skin_covered: float  # of the skin, the fraction that it is near to; faces where the scan cut the body do not count
+    on_skin: float  # of its own surface, the fraction that is near to the skin
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,10 +320,8 @@ def agreement(mesh: TriangleMesh, skin: Skin) -> Agreement:
     within_mm = min(NEAR_MM, NEAR * float(np.linalg.norm(np.ptp(skin.mesh.bounds, axis=0))))
     open_skin = ~skin.cut_faces if not skin.cut_faces.all() else skin.cut_faces
     seen = TriangleMesh(skin.mesh.vertices, skin.mesh.faces[open_skin])
-    return Agreement(
-        fraction_near(spread_on(seen, POINTS).points, mesh, within_mm),
-        fraction_near(spread_on(mesh, POINTS).points, skin.mesh, within_mm),
-    )
+    covered = fraction_near(spread_on(seen, POINTS).points, mesh, within_mm)
+    return Agreement(covered, fraction_near(spread_on(mesh, POINTS).points, skin.mesh, within_mm))
 
 
 def fraction_near(points: Floats, other: TriangleMesh, within_mm: float) -> float:

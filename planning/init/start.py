@@ -22,18 +22,9 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, point_text
-from puncture_twin.planning.init import segmentation
+from puncture_twin.planning.init import segmentation, target as targets
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.target import (
-    Holding,
-    assign,
-    label_target,
-    likely_region,
-    parse_point,
-    role_notes,
-    typed_target,
-)
 from puncture_twin.planning.registration.fiducials import Stated, find_fiducials
 
 ALLOWED = (
@@ -77,7 +68,7 @@ class Start:
 def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     """The text of a case with the files of a folder. Raises InputError: all that keeps it from being made, in one."""
     space, overrides = request.wanted.space, request.wanted.overrides
-    point = None if request.target is None else parse_point(request.target, space)
+    point = None if request.target is None else targets.parse_point(request.target, space)
     found = find(segmentation.Place(request.folder, cache, progress), request.wanted)
     names = [name for one in found.segmentations for name in one.names.values()]
     if not found.problems:
@@ -97,19 +88,20 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     gone = frozenset(name for name, kind in stated.items() if kind != "unknown")
     outlines = segmentation.Outlines(found.segmentations, skin, gone)
     if point is None:
-        target = label_target(str(request.target_label), outlines, space)
+        target = targets.label_target(str(request.target_label), outlines, space)
     else:
         hit_radius_mm, space_stated = request.hit_radius_mm, request.space_stated
-        target = typed_target(point, outlines, space, space_stated=space_stated, hit_radius_mm=hit_radius_mm)
-    region = request.region or likely_region(names, target.holding.target)
+        target = targets.typed_target(point, outlines, space, space_stated=space_stated, hit_radius_mm=hit_radius_mm)
+    region = request.region or targets.likely_region(names, target.holding.target)
     left_out = outlines.at(target.point_ct)
     border = segmentation.bordering(target.holding.target, found.segmentations)
     carved = {name for name, fraction in border.items() if fraction >= segmentation.ALL_ROUND}
     holding = target.holding._replace(others=target.holding.others | carved)
+    roles = [targets.assign(one.names, region, holding, left_out, stated) for one in found.segmentations]
     # Those whose points lie in the CT come first.
     within = [ct is None or all(map(ct.surfaces.source.grid.holds, one.points.points)) for one in found.markers]
     order = sorted(zip(within, found.markers, strict=True), key=lambda pair: (not pair[0], pair[1].source))
-    markers = [one for _, one in order]
+    markers = tuple(one for _, one in order)
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,
@@ -119,8 +111,8 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         hit_radius_mm=target.hit_radius_mm,
         ct=None if ct is None else ct.source,
         skin=skin_source,
-        sources=tuple((one, assign(one.names, region, holding, left_out, stated)) for one in found.segmentations),
-        markers=tuple(markers) or tuple(filter(None, [seen])),
+        sources=tuple(zip(found.segmentations, roles, strict=True)),
+        markers=markers or tuple(filter(None, [seen])),
         left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
@@ -152,8 +144,7 @@ def _checked(
     def problem(what: str, code: str, allowed: str = ALLOWED) -> None:
         problems.append(InputListError(what, where=HERE, allowed=allowed, code=code))
 
-    holding = [one for one in found.cts if point is not None and one.surfaces.source.grid.holds(point)]
-    cts = holding or found.cts
+    cts = [one for one in found.cts if point is not None and one.surfaces.source.grid.holds(point)] or found.cts
     listed = [f"{name} ({why})" for name, why in found.passed]
     listed += [f"{one.source} (a CT)" for one in found.cts]
     listed += [f"{one.source} (a segmentation)" for one in found.segmentations]
@@ -212,7 +203,7 @@ def _seen_in_ct(folder: Path, found: Found, ct: Ct | None, skin: Skin) -> tuple[
 
 
 def _notes(
-    request: Request, found: Found, of_target: Sequence[str], parts: CaseParts, holding: Holding
+    request: Request, found: Found, of_target: Sequence[str], parts: CaseParts, holding: targets.Holding
 ) -> Iterator[str]:
     if found.passed:
         yield f"left out: {first_few([f'{name} ({why})' for name, why in found.passed])}"
@@ -222,7 +213,7 @@ def _notes(
     for one in found.segmentations:
         yield from one.notes
     yield from of_target
-    yield from role_notes(parts.rows, holding)
+    yield from targets.role_notes(parts.rows, holding)
     if request.region is None:
         if_phantom = ", phantom for a phantom" if parts.region == "other" else ""
         yield f'region = "{parts.region}" was inferred from the structures; use --region to change it{if_phantom}'

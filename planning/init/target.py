@@ -10,16 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from puncture_twin.planning.anatomy.default_roles import (
-    BODY,
-    LESION,
-    NOT_ANNOTATED,
-    UNKNOWN_NAME,
-    default_role,
-    named_as_crossed,
-    named_as_lesion,
-    never_crossed,
-)
+from puncture_twin.planning.anatomy import default_roles
+from puncture_twin.planning.anatomy.default_roles import BODY, NOT_ANNOTATED, UNKNOWN_NAME, default_role, never_crossed
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
@@ -83,10 +75,12 @@ def assign(
             rows.append(Assigned(label, name, "target", 0.0, line))
         elif name in holding.others and not outline and never_crossed(name) is None:
             # About the target, and no vessel or the like: crossed only if its name tells it wholly.
-            kind, margin_mm = ("traverse", 0.0) if named_as_crossed(name) else ("unknown", demanding.margin_mm)
-            rows.append(Assigned(label, name, kind, margin_mm, line if kind == "traverse" else demanding))
+            if default_roles.named_as_crossed(name):
+                rows.append(Assigned(label, name, "traverse", 0.0, line))
+            else:
+                rows.append(Assigned(label, name, "unknown", demanding.margin_mm, demanding))
         else:
-            line = UNKNOWN_NAME if line.kind == "traverse" and not named_as_crossed(name) else line
+            line = UNKNOWN_NAME if line.kind == "traverse" and not default_roles.named_as_crossed(name) else line
             rows.append(Assigned(label, name, line.kind, line.margin_mm, line))
     return rows
 
@@ -125,9 +119,9 @@ def chosen_target(names: Collection[str]) -> str:
     certain (an organ that a needle crosses, or a vessel that none does), else the first: beside a pancreas that holds
     the target too, an ``SMA`` is not taken for the target, nor a ``Tumorvene`` beside a tumour.
     """
-    sure = [name for name in names if named_as_lesion(name)]
-    lesions = [name for name in names if default_role(name, "other") == LESION]
-    certain = [name for name in names if named_as_crossed(name) or never_crossed(name) is not None]
+    sure = [name for name in names if default_roles.named_as_lesion(name)]
+    lesions = [name for name in names if default_role(name, "other") == default_roles.LESION]
+    certain = [name for name in names if default_roles.named_as_crossed(name) or never_crossed(name) is not None]
     return next(iter([*sure, *lesions, *certain, *names]))
 
 
@@ -184,10 +178,9 @@ def parse_point(text: str, space: Space) -> Floats:
 def typed_target(
     point_ct: Floats, outlines: Outlines, space: Space, *, space_stated: bool, hit_radius_mm: float | None = None
 ) -> Target:
-    """A point that was typed, with the structures that hold it.
+    """A point (3,), LPS mm, that was typed, with the structures that hold it.
 
     Args:
-        point_ct: Shape (3,), LPS mm.
         outlines: The body's, with all segmentations that may hold the point.
         hit_radius_mm: Stated where the target is a ball of its own, whatever holds it; else None.
 
@@ -245,8 +238,7 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
     notes = [f"the target is the deepest point of '{name}': {point_text(point, space)}"]
     if parts > 1:
         notes.append(f"'{name}' has {parts} parts; the largest was used")
-    others = frozenset(_holders(point, outlines)) - {name}
-    return Target(point, Holding(name, others), tuple(notes))
+    return Target(point, Holding(name, frozenset(_holders(point, outlines)) - {name}), tuple(notes))
 
 
 def _holders(point_ct: Floats, outlines: Outlines) -> list[str]:

@@ -117,7 +117,8 @@ class Beam:
     def bent(self, foundation: Floats, rest: Floats, *, tip_mm: float | None = None, tip_load: float = 0.0) -> Shape:
         """The shape in a foundation k (elements,), N/mm^2, 0 in the air, at rest c at the nodes (elements + 1,), mm.
 
-        Something holds the tip at a deflection, mm, or it is free (None), under a lateral load, N.
+        Rest is linear between nodes. Something holds the tip at a deflection, mm, or it is free (None), under a lateral
+        load, N.
         """
         bands, h, first, second = self._bands(foundation), self.step, rest[:-1], rest[1:]
         load = np.zeros(2 * (self.elements + 1))  # the integral of k c N over each element

@@ -87,7 +87,10 @@ class Pushed(NamedTuple):
 
 
 def pushed(layers: Sequence[Layer], target_mm: float) -> Pushed | None:
-    """The shift of the tissue at a depth, where it says by what the body holds it: F / K."""
+    """The shift of the tissue at a depth, where it says by what the body holds it: F / K.
+
+    F, N, is what the needle does to that tissue alone: capsule, cutting and friction.
+    """
     own = next(layer.tissue for layer in layers if target_mm <= layer.end_mm + ROUNDING_MM)
     if own.held_n_mm is None:
         return None

@@ -42,7 +42,6 @@ from puncture_twin.planning.collision.bodies import FclSkin, Solid, connected_pa
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import PATIENT
-from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, patient_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.place.estimate import Boxes, Estimator, ReachEstimate, SkinField, Surroundings
@@ -62,6 +61,28 @@ from puncture_twin.planning.registration.placement import Placement, default_met
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+GoesOn = Callable[[int, int | None], bool]
+"""Called with how many directions were checked, summed over placements, of how many (None before the finalists are
+known); False ends the search."""
+COARSE_DIRECTIONS = 64
+"""Directions that a site is estimated with at first."""
+FINE_DIRECTIONS = 128
+"""Directions that sites near the best are estimated with."""
+SEEDS, OF_MOUNT = 12, 3
+"""Sites that are refined; so many of each mount are among them: the best estimate is not always of the best site."""
+HALVINGS = 3
+"""How often the step is halved: from 150 mm to 19 mm, about as exactly as a base is set up."""
+FIRST, SECOND = 64, 512
+"""Directions, evenly spread, in which a placement is checked before it is checked in all."""
+PIECE = 256
+"""Directions checked in one piece: some tenths of a second to some seconds."""
+FINALISTS = 10
+"""Placements that are checked in all directions; each mount's best two are among them."""
+FRACTION_DIGITS = 3
+"""Fractions that agree to so many digits are equal; then the expected error decides, then the margin."""
+ERROR_DIGITS = 2
+"""Expected errors (mm) that agree to so many digits are equal."""
 
 
 def placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
@@ -130,7 +151,7 @@ class PlacementCheck:
                 (*(Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed), *self.carried),
                 self.skin.transformed(T_base_ct),
                 outside=None if self.outside is None else self.outside.transformed(T_base_ct),
-                padding_mm=ARM_PADDING_MM,
+                padding_mm=workcell.ARM_PADDING_MM,
                 cache=user_cache(),
             )
         except InputError as error:
@@ -178,7 +199,7 @@ def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -
 def needle_can_start(tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections) -> NDArray[np.bool_]:
     """Which directions (n,) leave the padded needle at standoff clear of the skin: no placement reaches others."""
     start, end = tool.needle_span_mm
-    radius, length = tool.needle_diameter_mm / 2 + ARM_PADDING_MM, end - start + 2 * ARM_PADDING_MM
+    radius, length = tool.needle_diameter_mm / 2 + workcell.ARM_PADDING_MM, end - start + 2 * workcell.ARM_PADDING_MM
     needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])
     patient = FclSkin(skin, PATIENT)
     # From the tip, at the standoff from the target, the needle's middle is half its body farther out.
@@ -188,29 +209,6 @@ def needle_can_start(tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: 
         needle.place(fcl.Transform(T[:3, :3], T[:3, 3]))
         clear[row] = not patient.touches(needle, np.array([-half, half]))
     return clear
-
-
-GoesOn = Callable[[int, int | None], bool]
-"""Called with how many directions were checked, summed over placements, of how many (None before the finalists are
-known); False ends the search."""
-COARSE_DIRECTIONS = 64
-"""Directions that a site is estimated with at first."""
-FINE_DIRECTIONS = 128
-"""Directions that sites near the best are estimated with."""
-SEEDS, OF_MOUNT = 12, 3
-"""Sites that are refined; so many of each mount are among them: the best estimate is not always of the best site."""
-HALVINGS = 3
-"""How often the step is halved: from 150 mm to 19 mm, about as exactly as a base is set up."""
-FIRST, SECOND = 64, 512
-"""Directions, evenly spread, in which a placement is checked before it is checked in all."""
-PIECE = 256
-"""Directions checked in one piece: some tenths of a second to some seconds."""
-FINALISTS = 10
-"""Placements that are checked in all directions; each mount's best two are among them."""
-FRACTION_DIGITS = 3
-"""Fractions that agree to so many digits are equal; then the expected error decides, then the margin."""
-ERROR_DIGITS = 2
-"""Expected errors (mm) that agree to so many digits are equal."""
 
 
 @dataclass(frozen=True)
@@ -285,10 +283,10 @@ def search_placements(
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
     near, beyond = _parted(anatomy)
     surroundings = Surroundings(
-        SkinField.of(near), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), ARM_PADDING_MM
+        SkinField.of(near), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), workcell.ARM_PADDING_MM
     )
     spread = check.wanted.spread(SECOND)
-    starts = needle_can_start(check.tool, patient_surface(anatomy), case.target_ct, spread)
+    starts = needle_can_start(check.tool, workcell.patient_surface(anatomy), case.target_ct, spread)
     if not starts.any():
         what = "in every organ-safe direction the needle would start too near the skin"
         raise NoAnswerError(what, code="standoff_in_skin")

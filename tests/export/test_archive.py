@@ -25,7 +25,7 @@ from puncture_twin.planning.export.archive import (
     rod_points,
     surface_points,
 )
-from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.formats.dicom.ct_series import parse_series
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.run_twin import main
 
@@ -57,7 +57,7 @@ def series_of(slices, folder):
         stream = io.BytesIO()
         one.save_as(stream, enforce_file_format=True)
         content[f"{number}.dcm"] = stream.getvalue()
-    return CtSeries(folder, tuple(content), content.__getitem__)
+    return parse_series(folder, tuple(content), content.__getitem__)
 
 
 def centres(scan):

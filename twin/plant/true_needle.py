@@ -161,7 +161,7 @@ def draw_touch_truth(
 def draw_pivot_truth(
     T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the errors of an arm that sets its tip onto one place (3,), mm, n times; the patient lies as believed."""
+    """Draw the errors of an arm that sets its tip onto one place (3,), mm, n times; the patient is at T_base_ct (4, 4)."""
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     aim_base = place_base + rng.normal(0.0, errors.touch_mm, (len(names), 3))
@@ -178,7 +178,7 @@ class AtTarget(NamedTuple):
 
 
 def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
-    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error, mm."""
+    """Draw the arrival: joints drifted since the touches with an error of their own; the target, read at (3,), mm."""
     rng = np.random.default_rng([seed, 2])
     arrival = rng.normal(size=6) * np.hypot(errors.arm.arriving, errors.arm.drift)
     values, axes = np.linalg.eigh(errors.target_cov_ct)

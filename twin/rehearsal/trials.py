@@ -55,7 +55,7 @@ class Puncture:
 
 
 class Trials(NamedTuple):
-    """Results of n trials; CT frame, mm; positions are relative to what body, breath and needle have moved."""
+    """Results of n trials; CT frame, mm; positions are relative to the target, which the last three have moved."""
 
     tip_ct: Floats  # shape (n, 3), where the tip ended
     outward_ct: Floats  # shape (n, 3), unit, from there along the needle
@@ -216,7 +216,7 @@ def commanded(
     """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether.
 
     By T_base_ct (n, 4, 4), as registered; the needle is corrected by ``moved_base`` (n, 3), mm, and ends so far before
-    the target, near joints (6,), rad, that were planned there.
+    the target, near joints (6,), rad, that were planned there (None: those of the insertion).
     """
     q_near = puncture.q_insertion if q_near is None else q_near
     R_ct_flange = puncture.T_base_ct[:3, :3].T @ flange_pose(puncture.model, puncture.q_insertion)[:3, :3]

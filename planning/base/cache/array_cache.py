@@ -25,14 +25,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from puncture_twin.planning.base.cache.entry_file import (
-    Arrays,
-    DamagedError,
-    check_own,
-    packed,
-    read_plain_file,
-    unpacked,
-)
+from puncture_twin.planning.base.cache import entry_file
+from puncture_twin.planning.base.cache.entry_file import Arrays, DamagedError
 from puncture_twin.planning.base.cache.source_stamp import library_versions, module_unedited, source_stamp
 from puncture_twin.planning.base.errors import CacheWarning, InputError, refuse
 from puncture_twin.planning.base.files import atomic
@@ -58,11 +52,7 @@ class StoredFile(NamedTuple):
 
 
 def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> None:
-    """Write an entry, whole or not at all (OSError, InputError where it cannot be); then make the folder fit again.
-
-    Raises:
-        OSError, InputError: The folder cannot be written to.
-    """
+    """Write an entry, whole or not at all, then make the folder fit. Raises OSError, InputError: it cannot be."""
     if len(content) > most_bytes:
         return
     path = folder / entry.file
@@ -106,13 +96,10 @@ MEMORY_BYTES = 500_000_000
 
 
 class Memory:
-    """Values by key, bounded in size: the least recently used goes first.
+    """Values by key, in ``most_bytes`` together: the least recently used goes first, and 0 keeps nothing.
 
     A key holds the maker's name, the hashes of all bytes that the value is made from, and every option that decides it;
     never a path. A value is not changed after it was made. What raises is not kept. Threads may share one.
-
-    Args:
-        most_bytes: What the values may hold together; 0 keeps nothing.
     """
 
     def __init__(self, most_bytes: int = 0) -> None:
@@ -234,7 +221,7 @@ class Cache:
             found = _Read(made, read(made))
             if self.folder is not None and module_unedited(entry.maker):  # else it may be of newer code than its stamp
                 with suppress(OSError, InputError):  # a folder that cannot be written to costs time, not the result
-                    store(self.folder, entry, packed(made, entry.key), self.most_bytes)
+                    store(self.folder, entry, entry_file.packed(made, entry.key), self.most_bytes)
         return found
 
 
@@ -245,8 +232,7 @@ NO_CACHE = Cache(None)
 def user_cache() -> Cache:
     """This user's: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
 
-    Raises:
-        InputError: ``$PUNCTURE_TWIN_CACHE_MB`` is no number.
+    Raises InputError: ``$PUNCTURE_TWIN_CACHE_MB`` is no number.
     """
     named = os.environ.get(FOLDER_VARIABLE)
     if named is not None:
@@ -286,9 +272,9 @@ def _generation(by: str) -> str:
 
 def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
     """The arrays of an entry; None where there is no entry, or, with a note, a damaged one."""
-    check_own(path)
+    entry_file.check_own(path)
     try:
-        arrays = unpacked(read_plain_file(path), key)
+        arrays = entry_file.unpacked(entry_file.read_plain_file(path), key)
         found = _Read(arrays, read(arrays))
     except FileNotFoundError:
         return None

@@ -156,11 +156,7 @@ def _refusal(path: Path, what: str) -> InputError:
 
 
 def read_plain_file(path: Path) -> bytes:
-    """The content of a file that is really one, else DamagedError; a pipe is not waited for.
-
-    Raises:
-        FileNotFoundError: It is not there. DamagedError: It is something else than a file, or cannot be read.
-    """
+    """The content of a real file; a pipe is not waited for. Raises FileNotFoundError, DamagedError: it is none."""
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
             raise DamagedError("is not a regular file")

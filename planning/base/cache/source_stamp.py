@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -28,12 +28,7 @@ anew."""
 def source_stamp(module: str) -> str:
     """The hash of a module's source and of all that it imports from the project, directly or through others.
 
-    Args:
-        module: Its name, such as ``puncture_twin.planning.anatomy.surfaces``.
-
-    Raises:
-        ModuleNotFoundError: The project has no such module as a file: what it makes could not be told from what
-            another version makes.
+    Raises ModuleNotFoundError: it is no file: what it makes could not be told from what another version makes.
     """
     files = list(_files_of(module))
     if not files:
@@ -43,13 +38,12 @@ def source_stamp(module: str) -> str:
 
 def sources_with(word: bytes) -> list[str]:
     """The project's source files in which a word stands."""
-    return [file for part in PARTS for file in _sources_in(PACKAGE / part) if word in _source(file)]
-
-
-def _sources_in(folder: Path) -> Iterator[str]:
-    for place, folders, files in os.walk(folder):
+    found = list[str]()
+    for place, folders, files in (one for part in PARTS for one in os.walk(PACKAGE / part)):
         folders[:] = (name for name in folders if name != "__pycache__")
-        yield from (f"{place}/{name}" for name in files if name.endswith(".py"))
+        sources = (f"{place}/{name}" for name in files if name.endswith(".py"))
+        found += [file for file in sources if word in _source(file)]
+    return found
 
 
 def stamp_of(files: Iterable[str]) -> str:

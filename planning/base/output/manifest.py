@@ -99,8 +99,7 @@ class Output(NamedTuple):
     path: Path
     data: bytes
     sha256: str
-    note: str
-    """A warning where the file lies outside of any set, else empty."""
+    note: str  # a warning where the file lies outside of any set, else empty
 
     def input(self, role: str) -> Input:
         """This file as an input, for the provenance of what is made from it."""

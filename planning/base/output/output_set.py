@@ -126,9 +126,7 @@ def writing(
 def withdraw(out: Path, command: str, *, keep: Iterable[str] = ()) -> None:
     """Remove what a command left earlier, where a new run was refused: an old answer must not stand beside it.
 
-    Args:
-        out: The output folder; untouched where no command has written into it.
-        keep: Files of the entry that stay: they may be the input.
+    Nothing is touched where it has not written; ``keep`` are files that stay: they may be the input.
     """
     if out.is_dir() and manifest.read_manifest(out):
         with writing(out, command) as draft:

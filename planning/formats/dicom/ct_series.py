@@ -5,167 +5,109 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, text
 from puncture_twin.planning.formats.dicom.pixels import PixelLayout, pixel_layout, stored_values
 from puncture_twin.planning.formats.dicom.recognise import choose_series, described
-from puncture_twin.planning.formats.dicom.slices import (
-    Slice,
-    Stack,
-    StraightGrid,
-    moved,
-    slices_of,
-    stack_of,
-    straight_grid,
-)
+from puncture_twin.planning.formats.dicom.slices import Slice, Stack, moved, slices_of, stack_of, straight_grid
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Content, Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, check_affine, check_shape
 
 LOSSY = "{} files have lossy compression, so their values are not exact"
 CLASS_IN_META = "{} files state no SOP class; the one in their meta information was used"
 SCOUTS = "{} frames are scouts (by their type) and were left out"
+TILTED = (
+    "scanned with the gantry tilted by {:.1f} degrees; its slices were moved to a rectangular grid, and the part that "
+    "they do not cover counts as not scanned"
+)
 UNMEASURED_HU = -2000.0
 """Written where the scanner did not measure: far below air, so that nothing takes it for air or body."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Series:
-    """Facts of the headers of all files together."""
-
-    stack: Stack
-    grid: StraightGrid
-    layouts: dict[str, PixelLayout]
-    series_uid: str
-    frame_of_reference: str
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
 class CtSeries:
-    """A CT series in one folder. Its headers are read once, its pixels at each call of `volume`."""
+    """A CT series in one folder. Its headers were read once, its pixels are read at each call of `volume`."""
 
     path: Path
     files: tuple[str, ...]  # every file of the series, by its key in ``content``
     content: Content
-    aside: tuple[str, ...] = ()
+    notes: tuple[str, ...]  # what was left out, and what was done to the slices
+    frame_of_reference: str  # the UID of the coordinates in which it lies; empty where it is not stated
+    stack: Stack  # the slices as they were scanned
+    layouts: dict[str, PixelLayout]  # of each file
+    slice_shape: tuple[int, int]  # columns and rows of a slice as it was scanned
+    shifts: Floats  # shape (n, 2), where pixel (0, 0) of each slice lies in the grid, in pixels
+    grid: VolumeGrid  # of `volume`'s voxels, LPS mm
     part: tuple[str, ...] = ()
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes on what was left out, and what was done to the slices."""
-        notes = list(self.aside)
-        if (tilt := self._series.grid.tilt_deg) > 0:
-            notes.append(
-                f"{self.path.name}: scanned with the gantry tilted by {tilt:.1f} degrees; its slices were moved to "
-                "a rectangular grid, and the part that they do not cover counts as not scanned"
-            )
-        return (*notes, *self._series.notes)
-
-    @property
-    def frame_of_reference(self) -> str:
-        """The UID of the coordinates in which it lies; empty where it is not stated."""
-        return self._series.frame_of_reference
-
-    @property
-    def series_uid(self) -> str:
-        """The UID of the series."""
-        return self._series.series_uid
-
-    @property
-    def stack(self) -> Stack:
-        """The slices as they were scanned."""
-        return self._series.stack
-
-    @property
-    def slice_shape(self) -> tuple[int, int]:
-        """Columns and rows of a slice as it was scanned."""
-        layout = next(iter(self._series.layouts.values()))
-        return layout.columns, layout.rows
-
-    @cached_property
-    def grid(self) -> VolumeGrid:
-        """Grid of `volume`'s voxels, LPS mm. Raises InputError: headers that make no volume, or no trusted one."""
-        straight = self._series.grid
-        shape = check_shape(straight.shape, where=self.path)
-        return VolumeGrid(shape, check_affine(straight.T_ct_index, where=self.path), {})
 
     def volume(self) -> Volume:
         """The voxels in HU, single precision; ``UNMEASURED_HU`` where unmeasured. Raises InputError: damaged."""
-        grid, series = self.grid, self._series
-        values = np.empty(grid.shape, np.float32, order="F")
+        values = np.empty(self.grid.shape, np.float32, order="F")
         places: dict[str, list[int]] = {}
-        for number, one in enumerate(series.stack.slices):
+        for number, one in enumerate(self.stack.slices):
             places.setdefault(one.file, []).append(number)
         for file, numbers in places.items():
-            layout = series.layouts[file]
+            layout = self.layouts[file]
             frames = stored_values(parse_dicom(self.content(file), Path(file)), layout, file)
             for number in numbers:
-                one = series.stack.slices[number]
+                one = self.stack.slices[number]
                 stored = frames[one.frame]
                 scaled = stored.astype(np.float64) * one.slope + one.intercept
                 if layout.padding is not None:
                     low, high = layout.padding
                     scaled[(stored >= low) & (stored <= high)] = np.nan
-                image = np.asarray(scaled.T, np.float32)
-                values[:, :, number] = _filled(moved(image, series.grid.shifts[number], grid.shape[:2]))
-        return Volume(values, grid.T_ct_index, self.path)
-
-    @cached_property
-    def _series(self) -> _Series:
-        every: list[Slice] = []
-        layouts: dict[str, PixelLayout] = {}
-        stated = set()
-        counts = Counter[str]()
-        for file in self.files:
-            data = parse_dicom(self.content(file), Path(file))
-            header = described(data, Path(file))
-            if not header.is_slice:
-                refuse(f"{header.sop_class}, not a CT slice", file, "an unchanged file", "not_a_ct")
-            stated.add((header.series_uid, header.frame_of_reference))
-            layouts[file] = pixel_layout(data, file)
-            own = slices_of(data, file, layouts[file].frames)
-            every += own
-            counts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
-            counts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
-            counts[SCOUTS] += layouts[file].frames - len(own)
-        if len(stated) != 1:
-            series, frames = (len({one[at] for one in stated}) for at in (0, 1))
-            what = f"files of {series} series and {frames} frames of reference"
-            refuse(what, self.path, "one of each", "several_series")
-        ((series_uid, frame_of_reference),) = stated
-        stack = stack_of(every, self.path)
-        rows, columns = _one_size(layouts, self.path)
-        grid = straight_grid(stack, rows, columns, self.path)
-        notes = tuple(f"{self.path.name}: {note.format(count)}" for note, count in counts.items() if count)
-        return _Series(stack, grid, layouts, series_uid, frame_of_reference, notes)
-
-
-def _filled(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.where(np.isnan(image), np.float32(UNMEASURED_HU), image)
-
-
-def _one_size(layouts: dict[str, PixelLayout], path: Path) -> tuple[int, int]:
-    first, size = "", (0, 0)
-    for file, layout in layouts.items():
-        if first and (layout.rows, layout.columns) != size:
-            what = f"{first} has {size[0]} x {size[1]} pixels, {file} has {layout.rows} x {layout.columns}"
-            refuse(what, path, "slices of the same size", "mixed_geometry")
-        first, size = file, (layout.rows, layout.columns)
-    return size
+                image = moved(np.asarray(scaled.T, np.float32), self.shifts[number], self.grid.shape[:2])
+                values[:, :, number] = np.where(np.isnan(image), np.float32(UNMEASURED_HU), image)
+        return Volume(values, self.grid.T_ct_index, self.path)
 
 
 def parse_series(path: Path, files: Sequence[str], content: Content, aside: tuple[str, ...] = ()) -> CtSeries:
-    """A series whose headers have been checked."""
-    series = CtSeries(path, tuple(files), content, aside)
-    _ = series.grid
-    return series
+    """A series whose headers have been checked; ``aside``: notes. Raises InputError: no volume, or no trusted one."""
+    every: list[Slice] = []
+    layouts: dict[str, PixelLayout] = {}
+    stated, counts = set[tuple[str, str]](), Counter[str]()
+    for file in files:
+        data = parse_dicom(content(file), Path(file))
+        header = described(data, Path(file))
+        if not header.is_slice:
+            refuse(f"{header.sop_class}, not a CT slice", file, "an unchanged file", "not_a_ct")
+        stated.add((header.series_uid, header.frame_of_reference))
+        layouts[file] = pixel_layout(data, file)
+        own = slices_of(data, file, layouts[file].frames)
+        every += own
+        counts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
+        counts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
+        counts[SCOUTS] += layouts[file].frames - len(own)
+    if len(stated) != 1:
+        series, references = (len({one[at] for one in stated}) for at in (0, 1))
+        refuse(f"files of {series} series and {references} frames of reference", path, "one of each", "several_series")
+    ((_, frame),) = stated
+    stack = stack_of(every, path)
+    rows, columns = _one_size(layouts, path)
+    straight = straight_grid(stack, rows, columns, path)
+    notes = [f"{path.name}: {note.format(count)}" for note, count in counts.items() if count]
+    if straight.tilt_deg > 0:
+        notes.insert(0, f"{path.name}: {TILTED.format(straight.tilt_deg)}")
+    grid = VolumeGrid(check_shape(straight.shape, where=path), check_affine(straight.T_ct_index, where=path), {})
+    size, shifts = (columns, rows), straight.shifts
+    return CtSeries(path, tuple(files), content, (*aside, *notes), frame, stack, layouts, size, shifts, grid)
+
+
+def _one_size(layouts: dict[str, PixelLayout], path: Path) -> tuple[int, int]:
+    """Rows and columns of every file."""
+    for (first, one), (file, other) in pairwise(layouts.items()):
+        if (other.rows, other.columns) != (one.rows, one.columns):
+            what = f"{first} has {one.rows} x {one.columns} pixels, {file} has {other.rows} x {other.columns}"
+            refuse(what, path, "slices of the same size", "mixed_geometry")
+    last = next(reversed(layouts.values()))
+    return last.rows, last.columns
 
 
 def read_series(path: Path) -> Volume:

@@ -1,9 +1,8 @@
 """The bytes of a DICOM file to its data set, once its magic, its transfer syntax and its wholeness are checked.
 
-Whether the bytes of a DICOM data set are whole: every element inside its parent, every sequence closed, in order.
-
-The library that reads values takes what is left of an element that was cut short, and keeps the last of two elements of
-one tag. A contour or a frame would be lost without a word; so the nesting is checked first (DICOM PS3.5, chapter 7).
+Whole is a data set in which every element lies inside its parent, every sequence is closed, and tags rise. The library
+that reads values takes what is left of an element that was cut short, and keeps the last of two elements of one tag: a
+contour or a frame would be lost without a word. So the nesting is checked first (DICOM PS3.5, chapter 7).
 """
 
 from __future__ import annotations
@@ -32,11 +31,7 @@ ALLOWED = "a complete DICOM file"
 
 @contextmanager
 def refused_if_damaged(where: str | Path) -> Iterator[None]:
-    """One InputError for whatever the library raises for damaged values, and none of its warnings on the terminal.
-
-    Raises:
-        InputError: The library could not read the file.
-    """
+    """One InputError for whatever the library raises for damaged values, and none of its warnings on the terminal."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -45,9 +40,8 @@ def refused_if_damaged(where: str | Path) -> Iterator[None]:
         raise
     except Exception as error:  # the library promises no kind of error for bytes that are damaged
         what = f"damaged ({type(error).__name__}: {str(error)[:200]})"
-        raise InputError(
-            what.encode("ascii", "replace").decode(), where=where, allowed=ALLOWED, code="file_damaged"
-        ) from error
+        plain = what.encode("ascii", "replace").decode()
+        raise InputError(plain, where=where, allowed=ALLOWED, code="file_damaged") from error
 
 
 def parse_dicom(content: bytes, path: Path) -> Dataset:
@@ -64,7 +58,8 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
             refuse_syntax(syntax, path)
         body = memoryview(content)[stream.tell() :]
         implicit = syntax == IMPLICIT
-        length = whole_length(body, implicit=implicit, where=path)
+        # Without the zeros that some programs write behind a data set.
+        length = _Walk(body, path).data_set(0, len(body), implicit=implicit, depth=0, closed=False)
         found = read_dataset(io.BytesIO(body[:length]), implicit, True)
         found.file_meta = meta
         return found
@@ -97,20 +92,14 @@ def value(data: Dataset, keyword: str, *, where: str) -> Any:
     return None if found is None or found == "" else found
 
 
-def has(data: Dataset, keyword: str) -> bool:
-    """Whether an element is present, empty or not."""
-    return keyword in data
-
-
 def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[float, ...]:
     """An element's value as so many finite numbers. Raises InputError: missing, of another count, or not finite."""
     found = value(data, keyword, where=where)
-    listed = list(found) if isinstance(found, MultiValue | list | tuple) else [] if found is None else [found]
     with refused_if_damaged(f"{where}: {keyword}"):
-        plain = tuple(float(one) for one in listed)
+        plain = tuple(float(one) for one in _listed(found))
     if len(plain) != count or not all(map(math.isfinite, plain)):
         what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        refuse(what, where, f"{plural(count, 'finite number')}", "missing_tag" if found is None else "bad_tag")
+        refuse(what, where, plural(count, "finite number"), "missing_tag" if found is None else "bad_tag")
     return plain
 
 
@@ -136,9 +125,11 @@ def text(data: Dataset, keyword: str, *, where: str) -> str:
 
 def texts(data: Dataset, keyword: str, *, where: str) -> tuple[str, ...]:
     """The values of an element as texts, none where it is absent."""
-    found = value(data, keyword, where=where)
-    listed = list(found) if isinstance(found, MultiValue | list | tuple) else [] if found is None else [found]
-    return tuple(str(one).strip() for one in listed)
+    return tuple(str(one).strip() for one in _listed(value(data, keyword, where=where)))
+
+
+def _listed(found: Any) -> list[Any]:
+    return list(found) if isinstance(found, MultiValue | list | tuple) else [] if found is None else [found]
 
 
 def sop_class_of(data: Dataset, *, where: str) -> str:
@@ -177,18 +168,11 @@ MAX_ELEMENTS = 3_000_000
 """In one file: a multi-frame image of 10,000 slices has a tenth of it."""
 
 
-def whole_length(data: memoryview, *, implicit: bool, where: Path) -> int:
-    """Bytes of a data set, behind the meta information, without the zeros that some programs write behind it."""
-    return _Walk(data, where).data_set(0, len(data), implicit=implicit, depth=0, closed=False)
-
-
 class _Walk:
     """One pass over a data set."""
 
     def __init__(self, data: memoryview, where: Path) -> None:
-        self._data = data
-        self._where = where
-        self._count = 0
+        self._data, self._where, self._count = data, where, 0
 
     def data_set(self, at: int, end: int, *, implicit: bool, depth: int, closed: bool) -> int:
         """Offset at which a data set ends: at ``end``, at the latest, or where ``closed``, at its delimiter."""
@@ -217,9 +201,8 @@ class _Walk:
                 self._refuse(f"element {_shown(tag)} has no length", at)
             return self._items(at, end, implicit=implicit or kind == b"UN", depth=depth + 1, closed=True)
         if at + length > end:
-            self._refuse(
-                f"cut short: element {_shown(tag)} promises {length} bytes, and {end - at} are left", at, "file_cut"
-            )
+            what = f"cut short: element {_shown(tag)} promises {length} bytes, and {end - at} are left"
+            self._refuse(what, at, "file_cut")
         if kind == b"UN" and _known(tag) == b"SQ":
             self._refuse(f"sequence {_shown(tag)} is stored without its value representation", at)
         if kind == b"SQ":

@@ -13,16 +13,8 @@ from pydicom.pixels.decoders.base import Decoder, get_decoder
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.formats.dicom.dicom_file import (
-    HOW_TO_CONVERT,
-    name,
-    number,
-    refuse_syntax,
-    refused_if_damaged,
-    text,
-    value,
-    whole,
-)
+from puncture_twin.planning.formats.dicom import dicom_file
+from puncture_twin.planning.formats.dicom.dicom_file import name, refuse_syntax, refused_if_damaged, value, whole
 from puncture_twin.planning.formats.dicom.storage import PLAIN
 
 MAX_SIDE = 4096
@@ -47,7 +39,7 @@ class PixelLayout:
 
 def pixel_layout(data: Dataset, where: str) -> PixelLayout:
     """Storage of an image's values. Raises InputError: colours, an unusual layout, no pixels, or too few or many."""
-    if (meaning := text(data, "PhotometricInterpretation", where=where)) != "MONOCHROME2":
+    if (meaning := dicom_file.text(data, "PhotometricInterpretation", where=where)) != "MONOCHROME2":
         what = f"{name('PhotometricInterpretation')} is {meaning or 'missing'}"
         refuse(what, where, "MONOCHROME2", "unsupported_feature")
     whole(data, "SamplesPerPixel", low=1, high=1, where=where)
@@ -98,13 +90,8 @@ def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any
 def decoded_frames(data: Dataset, where: str, *, raw: bool) -> Iterator[NDArray[Any]]:
     """The frames one by one, each of shape (rows, columns) or (rows, columns, samples), plain or compressed.
 
-    Args:
-        data: An image whose sizes have been checked.
-        where: The file.
-        raw: Stored values as they are; else luminance and chrominance become RGB.
-
-    Raises:
-        InputError: A transfer syntax that no installed decoder reads, or pixels that are damaged.
+    ``raw``: stored values as they are; else luminance and chrominance become RGB. Raises InputError: no decoder for the
+    transfer syntax, or damaged pixels.
     """
     syntax = data.file_meta.TransferSyntaxUID
     decoder = _decoder(syntax, where)
@@ -121,7 +108,7 @@ def decoded_frames(data: Dataset, where: str, *, raw: bool) -> Iterator[NDArray[
                 frame = next(frames, None)
             except Exception as error:  # the decoders promise no kind of error
                 what = f"transfer syntax {syntax.name} ({syntax}): its pixels cannot be decoded ({str(error)[:150]})"
-                raise InputError(what, where=where, allowed=HOW_TO_CONVERT, code="not_decoded") from error
+                raise InputError(what, where=where, allowed=dicom_file.HOW_TO_CONVERT, code="not_decoded") from error
         if frame is None:
             return
         yield np.ascontiguousarray(frame[0])
@@ -138,7 +125,7 @@ def _decoder(syntax: UID, where: str) -> Decoder:
             refuse_syntax(syntax, where)
         if not decoder.is_available:
             what = f"transfer syntax {syntax.name} ({syntax}) needs a decoder that is not installed"
-            refuse(what, where, f"{HOW_TO_CONVERT}; or pip install python-gdcm", "no_decoder")
+            refuse(what, where, f"{dicom_file.HOW_TO_CONVERT}; or pip install python-gdcm", "no_decoder")
         return decoder
 
 
@@ -146,9 +133,9 @@ def _padding(data: Dataset, stored: int, signed: bool, where: str) -> tuple[int,
     """The range of stored values that mean "not measured"."""
     if value(data, "PixelPaddingValue", where=where) is None:
         return None
-    stated = [number(data, "PixelPaddingValue", where=where)]
+    stated = [dicom_file.number(data, "PixelPaddingValue", where=where)]
     if value(data, "PixelPaddingRangeLimit", where=where) is not None:
-        stated.append(number(data, "PixelPaddingRangeLimit", where=where))
+        stated.append(dicom_file.number(data, "PixelPaddingRangeLimit", where=where))
     # As so many bits hold them: writers state a padding with the sign of another type.
     ends = [int(end) % (1 << stored) for end in stated]
     plain = [end - (1 << stored) if signed and end >= 1 << (stored - 1) else end for end in ends]

@@ -58,12 +58,11 @@ def recognise(path: Path) -> DicomFile | None:
                 return None
             with dicom_file.refused_if_damaged(path):
                 meta = dicom_file.read_meta(stream)
-                if meta.TransferSyntaxUID in storage.NOT_READ:
-                    syntax, sop_class = UID(meta.TransferSyntaxUID), dicom_file.text(meta, _META_CLASS, where=str(path))
-                    if not sop_class or storage.kind_of(sop_class) is not storage.Kind.OTHER:
-                        dicom_file.refuse_syntax(syntax, path)
-                    other, called = storage.Kind.OTHER, UID(sop_class).name
-                    return DicomFile(path.name, other, called, "", syntax.name, "", is_slice=False, date="")
+                if (syntax := meta.TransferSyntaxUID) in storage.NOT_READ:
+                    sop_class, other = dicom_file.text(meta, _META_CLASS, where=str(path)), storage.Kind.OTHER
+                    if not sop_class or storage.kind_of(sop_class) is not other:
+                        dicom_file.refuse_syntax(UID(syntax), path)
+                    return DicomFile(path.name, other, UID(sop_class).name, "", UID(syntax).name, "", False, "")
                 implicit = meta.TransferSyntaxUID == storage.IMPLICIT
                 header = read_dataset(
                     stream, implicit, True, stop_when=lambda tag, *_: tag > _LAST_TAG, specific_tags=list(_TAGS)
@@ -89,16 +88,10 @@ def described(data: Dataset, path: Path) -> DicomFile:
     series_uid, frame_of_reference = text("SeriesInstanceUID"), text("FrameOfReferenceUID")
     dates = map(text, ("AcquisitionDate", "SeriesDate", "StudyDate"))  # read as far as the first that is one
     date = next((one for one in dates if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
-    return DicomFile(
-        name=path.name,
-        kind=kind,
-        sop_class=called,
-        series_uid=series_uid,
-        series=f"{number or '?'} {description or 'without description'}",
-        frame_of_reference=frame_of_reference,
-        is_slice=kind is storage.Kind.CT and placed and not types & NO_SLICES,
-        date=date and f"{date[:4]}-{date[4:6]}-{date[6:]}",
-    )
+    date = date and f"{date[:4]}-{date[4:6]}-{date[6:]}"
+    series = f"{number or '?'} {description or 'without description'}"
+    is_slice = kind is storage.Kind.CT and placed and not types & NO_SLICES
+    return DicomFile(path.name, kind, called, series_uid, series, frame_of_reference, is_slice, date)
 
 
 def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]:
@@ -122,7 +115,6 @@ class SeriesFiles:
 
     folder: Path
     names: tuple[str, ...]
-    series_uid: str
     notes: tuple[str, ...]  # what else lies in the folder and was left out, one sentence
 
 
@@ -145,14 +137,14 @@ def choose_series(path: Path) -> SeriesFiles:
         what = f"other files, possibly slices, cannot be read: {first_few([one.line for one in lost])}"
         allowed = "every slice of the series as a complete DICOM file (download or copy it again, or move it elsewhere)"
         refuse(what, path, allowed, "slices_not_read")
-    aside = [one for one in found if one.name not in set(names)]
     below = [one for one in others if one.what == FOLDER and _holds_dicom(folder / one.name)]
+    aside = [one for one in found if one.name not in set(names)]
     kinds = Counter(
         f"{one.sop_class} '{one.series}'" if one.kind is storage.Kind.CT else one.sop_class for one in aside
     )
     shown = [*(f"{count} {name}" for name, count in kinds.most_common()), *(f"DICOM in {one.name}" for one in below)]
     note = f"{path.name}: other files next to the CT series were left out: {first_few(shown)}"
-    return SeriesFiles(folder, names, slices[0].series_uid, (note,) if shown else ())
+    return SeriesFiles(folder, names, (note,) if shown else ())
 
 
 def _may_be_slice(one: Entry, names: Sequence[str]) -> bool:
@@ -180,13 +172,10 @@ def _check_one_series(
         series.setdefault(one.series_uid, []).append(one)
     if len(series) > 1:
         listed = [
-            f"{_count(files)} of '{files[0].series}' (such as {files[0].name}, UID {uid or 'missing'})"
+            f"{len(files)} file{'' if len(files) == 1 else 's'} of '{files[0].series}' (such as {files[0].name}, "
+            f"UID {uid or 'missing'})"
             for uid, files in list(series.items())[:SHOWN]
         ]
         more = f"; and {len(series) - SHOWN} more" if len(series) > SHOWN else ""
         allowed = "one series: give one of its files instead of the folder"
         refuse(f"{len(series)} CT series: {'; '.join(listed)}{more}", path, allowed, "several_series")
-
-
-def _count(files: Sequence[DicomFile]) -> str:
-    return f"{len(files)} file{'' if len(files) == 1 else 's'}"

@@ -12,18 +12,10 @@ from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.formats.dicom import dicom_file, named_masks
+from puncture_twin.planning.formats.dicom import dicom_file, named_masks, slices
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.dicom.pixels import check_length, sizes
-from puncture_twin.planning.formats.dicom.slices import (
-    AXES_TOLERANCE,
-    PLACE_TOLERANCE,
-    SPACING_TOLERANCE,
-    Groups,
-    Plane,
-    frame_groups,
-    plane_of,
-)
+from puncture_twin.planning.formats.dicom.slices import PLACE_TOLERANCE, Groups, Plane
 from puncture_twin.planning.formats.dicom.storage import PLAIN, SEGMENTATION
 from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import MAX_SPACING_MM, MIN_SPACING_MM, VolumeGrid, check_shape
@@ -41,7 +33,7 @@ class _Frames:
     """The frames of a segmentation."""
 
     segments: NDArray[np.int64]  # shape (n,), the segment of each frame
-    slices: NDArray[np.int64]  # shape (n,), where it lies, in steps from the first
+    steps: NDArray[np.int64]  # shape (n,), where it lies, in steps from the first
     T_ct_index: Floats  # shape (4, 4), maps (column, row, slice) to LPS mm
     rows: int
     columns: int
@@ -56,10 +48,9 @@ class _Placed:
 
 
 def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | None) -> named_masks.NamedMasks:
-    """The segments of a DICOM SEG, each by its label.
+    """The segments of a DICOM SEG, each by its label; ``file`` is its key in ``content``.
 
     Args:
-        file: The file's key in ``content``.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 
     Raises:
@@ -82,12 +73,10 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     frames = _frames(data, names, ct, path)
     placed = _placed(frames, ct, path)
     files = (file,) if ct is None else (file, *ct.files)
-    masks = {
-        called: named_masks.MaskVolume(
-            path, files, (called,), placed.grid, partial(_mask, data, frames, placed, segment, path)
-        )
-        for segment, called in names.items()
-    }
+    masks = {}
+    for segment, called in names.items():
+        make = partial(_mask, data, frames, placed, segment, path)
+        masks[called] = named_masks.MaskVolume(path, files, (called,), placed.grid, make)
     notes = [] if ct else [f"{where}: the case's CT is not a DICOM series, so this may belong to another CT"]
     if kind == "FRACTIONAL":
         notes.append(f"{where}: fractional segments; voxels of {HALF:g} or more count")
@@ -98,12 +87,8 @@ def _checked_kind(data: Dataset, path: Path) -> str:
     where = path.name
     kind = dicom_file.text(data, "SegmentationType", where=where)
     if kind not in ("BINARY", "FRACTIONAL"):
-        refuse(
-            f"{dicom_file.name('SegmentationType')} is {kind or 'missing'}",
-            path,
-            "BINARY, FRACTIONAL",
-            "unsupported_feature",
-        )
+        what = f"{dicom_file.name('SegmentationType')} is {kind or 'missing'}"
+        refuse(what, path, "BINARY, FRACTIONAL", "unsupported_feature")
     if data.file_meta.TransferSyntaxUID not in PLAIN:
         dicom_file.refuse_syntax(data.file_meta.TransferSyntaxUID, path)
     bits = 1 if kind == "BINARY" else 8
@@ -116,14 +101,13 @@ def _checked_kind(data: Dataset, path: Path) -> str:
 def _frames(data: Dataset, names: dict[int, str], ct: CtSeries | None, path: Path) -> _Frames:
     where = path.name
     rows, columns, count = sizes(data, where)
-    groups = frame_groups(data, count, where=where)
+    groups = slices.frame_groups(data, count, where=where)
     segments = np.array([_segment(one, f"{where}, frame {k + 1}", names) for k, one in enumerate(groups)])
-    planes = [plane_of(one, f"{where}, frame {k + 1}") for k, one in enumerate(groups)]
-    T, slices = _regular(planes, _stated_step(groups[0], where, ct), path)
-    pairs = set(zip(segments.tolist(), slices.tolist(), strict=True))
-    if len(pairs) < count:
+    planes = [slices.plane_of(one, f"{where}, frame {k + 1}") for k, one in enumerate(groups)]
+    T, steps = _regular(planes, _stated_step(groups[0], where, ct), path)
+    if len(set(zip(segments.tolist(), steps.tolist(), strict=True))) < count:
         refuse("two frames of one segment are at the same position", path, "one frame per slice", "duplicate_place")
-    return _Frames(segments, slices, T, rows, columns)
+    return _Frames(segments, steps, T, rows, columns)
 
 
 def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
@@ -139,11 +123,11 @@ def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
 def _stated_step(groups: Groups, where: str, ct: CtSeries | None) -> float | None:
     """Distance of slices by header or CT, mm; not the slice thickness, which may be thinner."""
     measures = groups.holder("PixelMeasuresSequence", where)
-    if dicom_file.has(measures, "SpacingBetweenSlices"):
+    if "SpacingBetweenSlices" in measures:
         step = dicom_file.number(measures, "SpacingBetweenSlices", where=where)
     elif ct is not None:
         step = float(ct.stack.step_ct @ ct.stack.plane.normal_ct)
-    elif dicom_file.has(measures, "SliceThickness"):
+    elif "SliceThickness" in measures:
         step = dicom_file.number(measures, "SliceThickness", where=where)
     else:
         return None
@@ -154,9 +138,8 @@ def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[
     """The affine of the frames' own grid, and the slice of each frame; frames that are left out are empty."""
     first = planes[0]
     for other in planes[1:]:
-        if np.abs(other.axes_ct - first.axes_ct).max() > AXES_TOLERANCE or not np.allclose(
-            other.spacing_mm, first.spacing_mm, rtol=SPACING_TOLERANCE
-        ):
+        turned = np.abs(other.axes_ct - first.axes_ct).max() > slices.AXES_TOLERANCE
+        if turned or not np.allclose(other.spacing_mm, first.spacing_mm, rtol=slices.SPACING_TOLERANCE):
             refuse("its frames have several orientations or pixel sizes", path, "one of each", "mixed_geometry")
     origins = np.array([plane.origin_ct for plane in planes])
     along = origins @ first.normal_ct
@@ -167,14 +150,14 @@ def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[
     if count > MAX_SLICES:
         refuse(f"{count} slices from its first to its last frame", path, f"{MAX_SLICES}", "too_many")
     step_ct = (high - low) / count if count else step * first.normal_ct
-    slices = np.round((along - along[order[0]]) / step).astype(np.int64)
-    off = np.linalg.norm(origins - low - slices[:, None] * step_ct, axis=1)
+    steps = np.round((along - along[order[0]]) / step).astype(np.int64)
+    off = np.linalg.norm(origins - low - steps[:, None] * step_ct, axis=1)
     if off.max() > PLACE_TOLERANCE * step:
         what = f"frame {int(np.argmax(off)) + 1} lies {off.max():.2f} mm off the grid of the others"
         refuse(what, path, f"frames at whole steps of {step:.4g} mm along one line", "off_grid")
     T = np.eye(4)
     T[:3, :2], T[:3, 2], T[:3, 3] = first.axes_ct * first.spacing_mm, step_ct, low
-    return T, slices
+    return T, steps
 
 
 def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
@@ -198,7 +181,7 @@ def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
 
 def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
     """The masks' grid: the CT's own slices where the frames lie on them, else a grid of their own."""
-    own = (frames.columns, frames.rows, int(frames.slices.max()) + 1)
+    own = (frames.columns, frames.rows, int(frames.steps.max()) + 1)
     if ct is not None:
         T_ct_slices, shape = ct.stack.T_ct_index, (*ct.slice_shape, len(ct.stack.slices))
         between = np.linalg.inv(T_ct_slices) @ frames.T_ct_index
@@ -214,7 +197,7 @@ def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: P
     i, j, k = placed.offset
     for frame in np.flatnonzero(frames.segments == segment).tolist():
         image = _image(data, frame, frames.rows, frames.columns, path)
-        made[i : i + frames.columns, j : j + frames.rows, k + int(frames.slices[frame])] = image.T
+        made[i : i + frames.columns, j : j + frames.rows, k + int(frames.steps[frame])] = image.T
     return made
 
 

@@ -18,7 +18,7 @@ from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.formats.dicom.dicom_file import has, items, name, number, numbers, sop_class_of, text, texts
+from puncture_twin.planning.formats.dicom.dicom_file import items, name, number, numbers, sop_class_of, text, texts
 from puncture_twin.planning.formats.dicom.recognise import NO_SLICES
 from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, MAX_SPACING_MM, MIN_SPACING_MM
@@ -61,14 +61,7 @@ class Slice:
 
 
 def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
-    """The slices of a CT file; scouts among the frames of an enhanced one are left out.
-
-    Args:
-        frames: How many images it holds.
-
-    Raises:
-        InputError: A position, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
-    """
+    """The slices of a CT file of so many frames, but for scouts. Raises InputError: no usable place or rescaling."""
     if sop_class_of(data, where=file) == CLASSIC_CT:
         if frames != 1:
             what = f"{name('NumberOfFrames')} is {frames} in a CT image of one slice"
@@ -77,12 +70,8 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     found = []
     for frame, groups in enumerate(frame_groups(data, frames, where=file)):
         label = f"{file}, frame {frame + 1}"
-        kinds = [
-            part.upper()
-            for one in groups.find("CTImageFrameTypeSequence", label)
-            for part in texts(one, "FrameType", where=label)
-        ]
-        if not set(kinds) & NO_SLICES:
+        types = [texts(one, "FrameType", where=label) for one in groups.find("CTImageFrameTypeSequence", label)]
+        if not {part.upper() for some in types for part in some} & NO_SLICES:
             found.append(_slice(file, frame, label, groups))
     return found
 
@@ -122,9 +111,8 @@ def plane_of(groups: Groups, label: str) -> Plane:
     """Position and orientation of a frame. Raises InputError: position, orientation or spacing is missing or wrong."""
     origin = numbers(groups.holder("PlanePositionSequence", label), "ImagePositionPatient", 3, where=label)
     cosines = numbers(groups.holder("PlaneOrientationSequence", label), "ImageOrientationPatient", 6, where=label)
-    between_rows, between_columns = numbers(
-        groups.holder("PixelMeasuresSequence", label), "PixelSpacing", 2, where=label
-    )
+    measures = groups.holder("PixelMeasuresSequence", label)
+    between_rows, between_columns = numbers(measures, "PixelSpacing", 2, where=label)
     if max(map(abs, origin)) > MAX_ORIGIN_MM:
         refuse(f"{name('ImagePositionPatient')} is {list(origin)}", label, f"{MAX_ORIGIN_MM} mm", "too_far")
     if not all(MIN_SPACING_MM <= one <= MAX_SPACING_MM for one in (between_rows, between_columns)):
@@ -149,7 +137,7 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
     if kind not in HOUNSFIELD:
         refuse(f"{name('RescaleType')} is {kind!r}", label, "HU (Hounsfield units)", "not_hounsfield")
     for keyword in ("RescaleSlope", "RescaleIntercept"):
-        if not has(rescale, keyword):
+        if keyword not in rescale:
             what = f"{name(keyword)} is missing, so its Hounsfield units are not known"
             refuse(what, label, WITH_RESCALE, "no_rescale")
     slope, intercept = (number(rescale, keyword, where=label) for keyword in ("RescaleSlope", "RescaleIntercept"))
@@ -192,23 +180,16 @@ class Stack:
 
 
 def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
-    """The stack that slices make.
-
-    Raises:
-        InputError: Fewer than two, other orientations or pixel sizes, several at one place, a step that is missing, or
-            uneven steps; the slices are named.
-    """
+    """The stack that slices make. Raises InputError: too few, several geometries, two at one place, or uneven steps."""
     if len(slices) < 2:
         refuse(f"{len(slices)} slice", where, "a series of at least 2 slices", "too_few_slices")
     first = slices[0]
     for other in slices[1:]:
-        difference = float(np.abs(first.plane.axes_ct - other.plane.axes_ct).max())
-        if difference > AXES_TOLERANCE:
+        if np.abs(first.plane.axes_ct - other.plane.axes_ct).max() > AXES_TOLERANCE:
             angle = np.degrees(np.arccos(np.clip(first.plane.normal_ct @ other.plane.normal_ct, -1.0, 1.0)))
             what = f"{first.label} and {other.label} have different orientations (normals {angle:.1f} degrees apart)"
             refuse(what, where, "slices of the same orientation", "mixed_geometry")
-        ratios = np.array(first.plane.spacing_mm) / other.plane.spacing_mm
-        if np.abs(ratios - 1.0).max() > SPACING_TOLERANCE:
+        if np.abs(np.array(first.plane.spacing_mm) / other.plane.spacing_mm - 1.0).max() > SPACING_TOLERANCE:
             what = f"{first.label} and {other.label} have different pixel sizes"
             refuse(f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where, "one", "mixed_geometry")
     normal = first.plane.normal_ct
@@ -281,8 +262,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
         what = f"the slice normal and the direction from slice to slice are {tilt:.0f} degrees apart"
         refuse(what, where, f"a tilt of at most {MAX_TILT_DEG:g} degrees", "gantry_tilt")
     if np.linalg.norm(sideways_mm) * (count - 1) <= NO_TILT_MM:
-        sideways_mm = np.zeros(2)
-        tilt = 0.0
+        sideways_mm, tilt = np.zeros(2), 0.0
     shifts = np.arange(count)[:, None] * (sideways_mm / plane.spacing_mm)
     low, high = np.floor(shifts.min(axis=0) + WHOLE_PIXEL), np.ceil(shifts.max(axis=0) - WHOLE_PIXEL)
     T = stack.T_ct_index
@@ -293,12 +273,9 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
 
 
 def moved(image: NDArray[np.float32], shift: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """An image placed in a larger one, NaN outside of it.
+    """An image (columns, rows), NaN where unmeasured, in a larger one of a shape, NaN outside of it.
 
-    Args:
-        image: Shape (columns, rows), NaN where nothing was measured.
-        shift: Where its pixel (0, 0) lies in the larger one, along each axis; 0 or more.
-        shape: Of the larger one.
+    ``shift``: where its pixel (0, 0) lies in the larger one, along each axis; 0 or more.
     """
     for axis in (0, 1):
         near = int(np.floor(shift[axis] + WHOLE_PIXEL))

@@ -29,6 +29,10 @@ ON_SLICE = 0.1
 """Fraction of the step by which a contour may miss its slice."""
 MAX_CONTOUR_POINTS = 100_000
 """In one contour: an image of 1000 pixels has 4000 around it."""
+GAPS = (
+    "slices without a contour, between two with one, were filled where both overlap or all are evenly spaced, and "
+    "otherwise left empty, in"
+)
 MAX_LENGTH = 5_000_000
 """Pixels along one contour; the finest line through every pixel of an image has fewer."""
 
@@ -50,18 +54,14 @@ class _Region:
 
 
 def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -> named_masks.NamedMasks:
-    """The regions of an RTSTRUCT, each by its name, on the slices of a CT.
+    """The regions of an RTSTRUCT, each by its name, on the slices of a CT; ``file`` is its key in ``content``.
 
     A slice between two contoured ones is filled with what either of them encloses, where they overlap: programs leave
     slices out and interpolate, and a gap in an organ would count as free. What encloses no pixel's centre counts for
     the pixels along it. Both are noted.
 
-    Args:
-        file: The file's key in ``content``.
-
     Raises:
-        InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
-            lie off the CT's slices.
+        InputError: No trusted structure set, of another frame of reference, or with contours off the CT's slices.
     """
     data = dicom_file.parse_dicom(content(file), path)
     where = path.name
@@ -76,9 +76,8 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
         called: named_masks.MaskVolume(path, files, (called,), grid, partial(_mask, regions[roi].contours, grid.shape))
         for roi, called in names.items()
     }
-    return named_masks.NamedMasks(
-        masks, tuple(_notes({names[roi]: region for roi, region in regions.items()}, grid, where))
-    )
+    notes = _notes({names[roi]: region for roi, region in regions.items()}, grid, where)
+    return named_masks.NamedMasks(masks, tuple(notes))
 
 
 def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
@@ -87,19 +86,17 @@ def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
         roi = dicom_file.whole(item, "ROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
         if roi in found:
             refuse(f"two regions have the number {roi}", path, "each number once", "duplicate_number")
-        named_masks.check_frame_of_reference(
-            dicom_file.text(item, "ReferencedFrameOfReferenceUID", where=path.name), ct, path
-        )
+        frame = dicom_file.text(item, "ReferencedFrameOfReferenceUID", where=path.name)
+        named_masks.check_frame_of_reference(frame, ct, path)
         found[roi] = dicom_file.text(item, "ROIName", where=path.name)
     return found
 
 
 def _regions(data: Dataset, names: dict[int, str], grid: VolumeGrid, path: Path) -> dict[int, _Region]:
     found: dict[int, _Region] = {}
-    if not dicom_file.has(data, "ROIContourSequence"):
-        refuse(
-            f"{dicom_file.name('ROIContourSequence')} is missing: was the file cut?", path, "contours", "missing_tag"
-        )
+    if "ROIContourSequence" not in data:
+        what = f"{dicom_file.name('ROIContourSequence')} is missing: was the file cut?"
+        refuse(what, path, "contours", "missing_tag")
     T_index_ct = np.asarray(np.linalg.inv(grid.T_ct_index), np.float64)
     for item in dicom_file.items(data, "ROIContourSequence", where=path.name):
         roi = dicom_file.whole(item, "ReferencedROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
@@ -124,7 +121,7 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
     if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
         allowed = "three finite numbers for each of at least three points"
         refuse(f"{dicom_file.name('ContourData')} has {len(flat)} numbers", label, allowed, "wrong_count")
-    if dicom_file.has(item, "NumberOfContourPoints"):
+    if "NumberOfContourPoints" in item:
         dicom_file.whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
     points_ct = flat.reshape(-1, 3)
     index = apply(T_index_ct, points_ct)
@@ -219,11 +216,7 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
     others = [called for called, region in regions.items() if region.others]
     findings = (
         (others, "contours that are not closed (points, lines) were left out of"),
-        (
-            gaps,
-            "slices without a contour, between two with one, were filled where both overlap or all are evenly "
-            "spaced, and otherwise left empty, in",
-        ),
+        (gaps, GAPS),
         (small, "contours smaller than a pixel count as the pixels along them, in"),
         (cut, "contours that reach beyond the CT's image end there, in"),
     )
@@ -237,18 +230,11 @@ def _is_tiny(points: Floats, shape: tuple[int, int]) -> bool:
 
 
 def polygon_fill(points: Floats, shape: tuple[int, int]) -> Bools:
-    """Pixels inside a polygon; a channel of no width between two parts of it (a keyhole) encloses nothing.
+    """Pixels (ni, nj) inside a closed polygon (n, 2), where (i, j) is the centre of a pixel; what lies outside is cut.
 
     A centre is inside if the edges that a ray from it along the first axis crosses upward and downward differ in
-    number: what is traced twice is inside still, where an odd count would leave it out. Each edge holds its lower end
-    and not its upper one, so that a vertex is counted once.
-
-    Args:
-        points: Shape (n, 2), in pixels: (i, j) is the centre of a pixel. The last is joined to the first.
-        shape: Of the image, (ni, nj); what lies outside of it is cut off.
-
-    Returns:
-        Shape (ni, nj).
+    number: what is traced twice is inside still, where an odd count would leave it out, and a channel of no width
+    (a keyhole) encloses nothing. Each edge holds its lower end and not its upper one: a vertex is counted once.
     """
     ni, nj = shape
     start, end = points, np.roll(points, -1, axis=0)

@@ -1,6 +1,4 @@
-"""A folder of masks: one volume a structure, named after its file, as TotalSegmentator writes them by default.
-
-Segments of a Slicer segmentation (.seg.nrrd), which may overlap: each is a label of one layer, and becomes a mask.
+"""Folders of masks, one volume a structure, named after its file; and segments of Slicer (.seg.nrrd), as masks.
 
 Source: Slicer documentation, "Segmentations", file format: ``SegmentN_Name``, ``SegmentN_LabelValue`` and, where the
 file has several layers, ``SegmentN_Layer``, counted from 0.
@@ -49,12 +47,8 @@ def structure_name(file: str) -> str:
 def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path) -> tuple[str, ...]:
     """The names of the masks in a folder, sorted; nothing else may lie in it that could be an organ.
 
-    Args:
-        known: Whether a path in it is something else that the case names.
-        where: The file and key that name the folder, for errors.
-
-    Raises:
-        InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
+    ``known``: whether a path in it is something else that the case names. Raises InputError: no folder, none, too many,
+    two of one structure, or entries that would be passed over.
     """
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one per structure"
     if not is_folder(folder):
@@ -103,9 +97,9 @@ def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> N
     """Refuse masks of a folder on two grids: what lies beyond the smaller one would count as free."""
     (first, grid), *others = headers.items()
     for name, other in others:
-        sizes = [" x ".join(map(str, one.shape)) for one in (grid, other)]
         if other.shape != grid.shape:
-            difference = f"{sizes[1]} voxels, not {sizes[0]}"
+            own, size = (" x ".join(map(str, one.shape)) for one in (other, grid))
+            difference = f"{own} voxels, not {size}"
         elif (apart := corner_deviation_mm(grid.T_ct_index, other.T_ct_index, grid.shape)) > SAME_PLACE_MM:
             difference = f"up to {apart:.1f} mm away"
         else:

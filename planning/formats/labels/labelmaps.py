@@ -1,14 +1,11 @@
 """Label maps: a whole number per voxel that says which structure it belongs to.
 
 A label's voxels become a closed surface in LPS mm by marching cubes on its 0/1 mask at 0.5, padded by background.
-Every vertex then lies in the middle between the centres of a voxel inside and one outside, that is on the face that
-they share; and every cell of eight voxel centres that the surface enters also holds a piece of the voxels' boundary,
-through its middle. So surface and boundary are never more than half a voxel apart along any axis (the larger of the
-three index differences), in both directions.
-
-The table of Lorensen and Cline (1987) in scikit-image decides each cell by signs alone and came out closed for
-every mask tried; its default (Lewiner 2003) compares products that are all equal in a 0/1 mask, and its ties
-left holes in random masks.
+Every vertex then lies in the middle between the centres of a voxel inside and one outside, on the face that they share;
+and every cell of eight voxel centres that the surface enters holds a piece of the voxels' boundary, through its middle.
+So surface and boundary are never more than half a voxel apart along any axis, in both directions. The table of Lorensen
+and Cline (1987) decides each cell by signs alone and came out closed for every mask tried; scikit-image's default
+(Lewiner 2003) compares products that are all equal in a 0/1 mask, and its ties left holes in random masks.
 
 Tables that say which label is which structure, as programs and people write them: CSV with any common naming of its
 columns, JSON (``{"1": "liver"}``, ``{"liver": 1}``, nnU-Net's ``labels``), label descriptions of ITK-SNAP and colour
@@ -34,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from skimage.measure import marching_cubes
 
 from puncture_twin.planning.base.arrays import Bools
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import check_name
@@ -84,9 +81,7 @@ class LabelMap:
 def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
     """The label map that a volume is, in LPS mm; one with background only may be the mask of an organ not there.
 
-    Raises:
-        InputError: Values that are negative, not whole or above ``MAX_LABEL``; a map with background only; segment
-            names that contradict each other.
+    Raises InputError: no labels (`whole_labels`), background only, or segment names that contradict each other.
     """
     names = segment_names(volume.fields, volume.path)
     labels, rounded_by = whole_labels(volume.values, volume.path)
@@ -96,11 +91,9 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
 
 
 def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer], float]:
-    """Voxels as whole numbers, and how far they were off, at most: `ROUNDED_BY`; a blended map has its own code.
+    """Voxels as whole numbers, and how far they were off, at most: `ROUNDED_BY`.
 
-    Raises:
-        InputError: Values that are negative, too large, or farther from whole numbers than `ROUNDED_BY`; those of a map
-            that was blended by an interpolation have a code of their own.
+    Raises InputError: negative, too large, or farther from whole numbers; a blended map has a code of its own.
     """
     low, high = values.min(), values.max()
     if low < -ROUNDED_BY or high > MAX_LABEL:
@@ -138,11 +131,9 @@ def segment_names(fields: Mapping[str, str], path: Path) -> dict[int, str] | Non
 
 
 def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict[str, Segment]:
-    """Name to layer and label, of every segment that the header lists.
+    """Name to layer and label, of every segment that the header's ``key:=value`` lines list.
 
-    Args:
-        remarks: The header's ``key:=value`` lines.
-        layers: How many the file holds; the layer of a segment may be left out where it is one.
+    ``layers`` are in the file; the layer of a segment may be left out where it is one.
     """
     numbers = sorted({int(at[1]) for key in remarks if (at := re.match(r"Segment(\d{1,6})_", key))})
     names = [check_name(remarks.get(f"Segment{n}_Name", ""), f"segment {n}", where=path) for n in numbers]
@@ -170,13 +161,10 @@ def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -
 
 
 def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> TriangleMesh:
-    """The surface of one label, closed, normals outward, in LPS mm.
+    """The surface of one label, closed, normals outward, in LPS mm. Raises InputError: if no voxel has this label.
 
-    A label that touches the border of the volume is closed there, on the outer face of its border voxels. The
-    result does not depend on the axis order or the flips in which the map is stored.
-
-    Raises:
-        InputError: If no voxel has this label.
+    At the border of the volume it is closed on the outer face of the border voxels. The result does not depend on the
+    axis order or the flips in which the map is stored.
     """
     box = labelmap.boxes.get(label)
     if box is None:
@@ -193,9 +181,7 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
 def mask_surface(mask: Bools, T_ct_index: NDArray[np.float64], *, where: str | Path) -> TriangleMesh:
     """The closed surface of a mask's voxels, as `framed_surface` of a field that is 1/2 inside and -1/2 outside.
 
-    Args:
-        mask: Shape (ni, nj, nk), somewhere True; only the box of what is True is looked at.
-        T_ct_index: Shape (4, 4), determinant positive.
+    Of a mask (ni, nj, nk), somewhere True, of which only that box counts; the affine (4, 4) has a positive determinant.
     """
     box = box_in(mask)
     framed, field = frame([axis.stop - axis.start for axis in box])
@@ -223,13 +209,10 @@ def frame(shape: Sequence[int]) -> tuple[NDArray[np.float32], NDArray[np.float32
 def framed_surface(
     framed: NDArray[np.float32], T_ct_index: NDArray[np.float64], *, where: str | Path, first: ArrayLike = 0
 ) -> TriangleMesh:
-    """The closed surface around where a field is positive, in LPS mm, normals outward.
-
-    Along the border the field is continued with its sign flipped, so the surface closes on the outer faces of
-    the border voxels.
+    """The closed surface around where a field is positive, in LPS mm, normals outward; at the border on outer faces.
 
     Args:
-        framed: Of `frame`: within, the field, never 0, positive inside, somewhere positive; its frame is written here.
+        framed: Of `frame`: within, the field, never 0, somewhere positive; its frame is written here, the sign flipped.
         T_ct_index: Shape (4, 4), determinant positive.
         first: Shape (3,), index of the field's first voxel, where it is part of a larger one.
     """
@@ -290,12 +273,9 @@ def _plain(text: str) -> str:
 
 def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     text = decode_text(data, str(path))
-    try:
-        first = text.partition("\n")[0]
-        separator = max((",", ";", "\t"), key=first.count)
+    separator = max((",", ";", "\t"), key=text.partition("\n")[0].count)
+    with refusing(csv.Error, "is not a CSV file", path, ALLOWED_CSV, "not_csv"):
         rows = list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
-    except csv.Error as error:
-        raise InputError(f"is not a CSV file ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
     header = rows[0] if rows else []
     plain = [_plain(cell) for cell in header]  # ``label`` is a name next to an id, and a number next to a name
     name = next((plain.index(one) for one in NAME_COLUMNS if one in plain), None)

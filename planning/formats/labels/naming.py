@@ -18,7 +18,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Generic, Protocol, TypeVar
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import check_name, did_you_mean, first_few
 from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, parse_names
 
@@ -38,43 +38,21 @@ def _numbered(*groups: str) -> Mapping[int, str]:
 
 
 V1: Mapping[int, str] = _numbered(
-    _ABDOMEN,
-    "aorta inferior_vena_cava portal_vein_and_splenic_vein pancreas adrenal_gland_right adrenal_gland_left",
-    _LUNGS,
-    _SPINE,
-    "esophagus trachea heart_myocardium heart_atrium_left heart_ventricle_left heart_atrium_right",
-    "heart_ventricle_right pulmonary_artery brain",
-    _ILIAC,
-    "small_bowel duodenum colon",
-    _RIBS,
-    _SHOULDERS,
-    _HIPS,
-    "sacrum face",
-    _GLUTEUS,
-    _BACK,
-    "urinary_bladder",
-)
+    _ABDOMEN, "aorta inferior_vena_cava portal_vein_and_splenic_vein pancreas adrenal_gland_right adrenal_gland_left",
+    _LUNGS, _SPINE, "esophagus trachea heart_myocardium heart_atrium_left heart_ventricle_left heart_atrium_right",
+    "heart_ventricle_right pulmonary_artery brain", _ILIAC, "small_bowel duodenum colon", _RIBS, _SHOULDERS, _HIPS,
+    "sacrum face", _GLUTEUS, _BACK, "urinary_bladder",
+)  # fmt: skip
 """Version 1."""
 V2: Mapping[int, str] = _numbered(
-    _ABDOMEN,
-    "pancreas adrenal_gland_right adrenal_gland_left",
-    _LUNGS,
+    _ABDOMEN, "pancreas adrenal_gland_right adrenal_gland_left", _LUNGS,
     "esophagus trachea thyroid_gland small_bowel duodenum colon urinary_bladder prostate",
-    "kidney_cyst_left kidney_cyst_right sacrum vertebrae_S1",
-    _SPINE,
+    "kidney_cyst_left kidney_cyst_right sacrum vertebrae_S1", _SPINE,
     "heart aorta pulmonary_vein brachiocephalic_trunk subclavian_artery_right subclavian_artery_left",
     "common_carotid_artery_right common_carotid_artery_left brachiocephalic_vein_left brachiocephalic_vein_right",
-    "atrial_appendage_left superior_vena_cava inferior_vena_cava portal_vein_and_splenic_vein",
-    _ILIAC,
-    _SHOULDERS,
-    _HIPS,
-    "spinal_cord",
-    _GLUTEUS,
-    _BACK,
-    "brain skull",
-    _RIBS,
-    "sternum costal_cartilages",
-)
+    "atrial_appendage_left superior_vena_cava inferior_vena_cava portal_vein_and_splenic_vein", _ILIAC, _SHOULDERS,
+    _HIPS, "spinal_cord", _GLUTEUS, _BACK, "brain skull", _RIBS, "sternum costal_cartilages",
+)  # fmt: skip
 """Version 2, task ``total``."""
 BUILT_IN: Mapping[str, Mapping[int, str]] = {"totalsegmentator-v1": V1, "totalsegmentator-v2": V2}
 OWN_NAMES = "seg.nrrd"
@@ -121,15 +99,12 @@ class Selection:
 
 
 class OwnNames(Protocol):
-    """A label map that may bring names of its own."""
+    """A label map that may bring names of its own: label to name."""
 
     @property
-    def path(self) -> Path:
-        """Its file."""
-
+    def path(self) -> Path: ...  # noqa: D102  the class says it
     @property
-    def names(self) -> Mapping[int, str] | None:
-        """Label to name, or None."""
+    def names(self) -> Mapping[int, str] | None: ...  # noqa: D102
 
 
 def is_naming_file(naming: str | None) -> bool:
@@ -138,15 +113,12 @@ def is_naming_file(naming: str | None) -> bool:
 
 
 def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes], labelmap: OwnNames) -> dict[int, str]:
-    """The names of labels, by number.
+    """The names of labels, by number. Raises InputError: an unknown naming, no names, or a table that cannot be used.
 
     Args:
         naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a table of names (CSV,
             JSON, ITK-SNAP's or Slicer's list), or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
         content: Gives the bytes of a table by its path.
-
-    Raises:
-        InputError: An unknown naming, a map without names of its own, or a table that cannot be used.
     """
     allowed = f"{', '.join(BUILT_IN)}, a table of names ({', '.join(NAME_ENDINGS)}), or a .seg.nrrd with names"
     if naming is None or naming == OWN_NAMES:
@@ -155,11 +127,11 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
         return _unique(labelmap.names, labelmap.path)
     if naming in BUILT_IN:
         return dict(BUILT_IN[naming])
-    if naming.lower().endswith(NAME_ENDINGS):
-        return _unique(parse_names(content(naming), folder / naming), folder / naming)
-    near = difflib.get_close_matches(naming, BUILT_IN, n=1)
-    hint = f" (nearest: {near[0]})" if near else ""
-    raise InputError(f"unknown naming {naming!r}{hint}", where=labelmap.path, allowed=allowed, code="unknown_naming")
+    if not naming.lower().endswith(NAME_ENDINGS):
+        near = difflib.get_close_matches(naming, BUILT_IN, n=1)
+        hint = f" (nearest: {near[0]})" if near else ""
+        refuse(f"unknown naming {naming!r}{hint}", labelmap.path, allowed, "unknown_naming")
+    return _unique(parse_names(content(naming), folder / naming), folder / naming)
 
 
 def select(
@@ -181,34 +153,32 @@ def select(
     Of equally specific ``avoid`` patterns the largest margin holds, and of ``unknown`` ones.
 
     Args:
-        avoid: Pattern to margin in mm.
-        unknown: Patterns of structures of which it is unknown whether a path may cross them.
+        avoid: Pattern to margin in mm, as ``unknown``, of which it is unknown whether a path may cross them.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
 
     Raises:
-        InputError: A label present that has no name or that no pattern names, one that two equally specific patterns of
-            different kinds name, a pattern that matches no name although all are known, or a margin that is negative or
-            not finite.
+        InputError: A label without a name, a pattern, or one kind; a pattern of no known name; a margin out of range.
     """
     free = ([(one, 0.0) for one in listed] for listed in (traverse, target, ignore))
     tables = zip(RuleKind, (avoid.items(), unknown.items(), *free), strict=True)
     patterns = [LabelRule(0, "", kind, float(mm), one) for kind, table in tables for one, mm in table]
     for rule in patterns:
-        if not (math.isfinite(rule.margin_mm) and rule.margin_mm >= 0):
+        if not 0 <= rule.margin_mm < math.inf:
             refuse(f"margin {rule.margin_mm} of pattern {rule.pattern!r}", where, "mm, 0 or more", "out_of_range")
     for rule in patterns:
         if all_named and rule.pattern != REST and not any(fnmatchcase(name, rule.pattern) for name in names.values()):
             near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
-            allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"
+            allowed = f"names like {', '.join(near)}" if near else f"one of {', '.join(sorted(names.values()))}"
             refuse(f"{rule.kind} pattern {rule.pattern!r} matches no name in the naming", where, allowed, "no_match")
     nameless = [label for label in sorted(present) if label not in names]
     if nameless:
-        refuse(f"labels without a name: {_listed(nameless)}", where, "labels of the naming", "labels_without_names")
+        listed = ", ".join(map(str, nameless))
+        refuse(f"labels without a name: {listed}", where, "labels of the naming", "labels_without_names")
     rules = [_rule(label, names[label], patterns, where) for label in sorted(present)]
     taken = tuple(rule for rule in rules if rule is not None)
     if missing := [names[label] for label, rule in zip(sorted(present), rules, strict=True) if rule is None]:
         allowed = "a pattern in avoid, unknown, traverse, target or ignore for each"
-        refuse(f"no rule covers these labels, which are present: {_listed(missing)}", where, allowed, "no_rule")
+        refuse(f"no rule covers these labels, which are present: {', '.join(missing)}", where, allowed, "no_rule")
     unused = [p for p in patterns if not any(fnmatchcase(names[label], p.pattern) for label in present)]
     warnings = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
     for rule in taken:
@@ -246,10 +216,6 @@ def _rule(label: int, name: str, patterns: Sequence[LabelRule], where: str | Pat
     return LabelRule(label, name, first.kind, first.margin_mm, first.pattern)
 
 
-def _listed(items: Sequence[object]) -> str:
-    return ", ".join(str(item) for item in items)
-
-
 def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
     """The names, each of one label: two structures of one name could not be distinguished in a result."""
     seen: dict[str, int] = {}
@@ -282,12 +248,7 @@ class ByName(Generic[T]):
         return None if best is None else self.of_pattern[best]
 
     def check(self, names: Iterable[str], key: str, where: str | Path, *, others: Iterable[str] = ()) -> None:
-        """Refuse patterns that leave a name out, match nothing, or contradict each other.
-
-        Args:
-            names: All that a pattern must match.
-            others: What needs none, and may be named all the same.
-        """
+        """Refuse patterns that leave a name out, match nothing, or contradict each other; ``others`` need none."""
         names, known = list(names), [*names, *others]
         if missing := [name for name in names if self.of(name) is None]:
             allowed = 'a pattern for each; "*" matches the rest'

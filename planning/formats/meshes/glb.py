@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse, schema_words
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.guard import MAX_TRIANGLES, MAX_VERTICES, RawMesh, join
@@ -142,17 +142,6 @@ def _chunks(data: bytes, where: str) -> tuple[bytes, bytes]:
     return chunks[0][1], binaries[0] if binaries else b""
 
 
-def _parse(text: bytes, where: str) -> Document:
-    tree = parse_json(text, where=where, allowed=_DOCUMENT_ALLOWED)
-    try:
-        return Document.model_validate(tree)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        place = ascii(".".join(str(step) for step in first["loc"]))
-        what = f"{place}: {schema_words(first)}"
-        raise InputError(what, where=where, allowed=_DOCUMENT_ALLOWED, code="bad_value") from error
-
-
 def _check_sizes(document: Document, size: int, where: str) -> None:
     """Hold the buffer against the BIN chunk, and the views against the buffer."""
     for buffer in document.buffers:
@@ -181,13 +170,18 @@ _VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
 
 
 def read_glb(data: bytes, where: str) -> RawMesh:
-    """The triangles of a GLB file's scene, in the unit of the file and its axes, y up by the standard (section 3.4).
+    """The triangles of a GLB file's scene, in its own unit and axes, y up by the standard (section 3.4).
 
-    Raises:
-        InputError: If it is cut, contradicts itself, or uses what is not supported.
+    Raises InputError: it is cut, contradicts itself, or uses what is not supported.
     """
     written, binary = _chunks(data, where)
-    document = _parse(written, where)
+    tree = parse_json(written, where=where, allowed=_DOCUMENT_ALLOWED)
+    try:
+        document = Document.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        what = f"{'.'.join(map(str, first['loc']))!a}: {schema_words(first)}"
+        raise InputError(what, where=where, allowed=_DOCUMENT_ALLOWED, code="bad_value") from error
     if not document.asset.version.startswith("2."):
         refuse(f"glTF version {document.asset.version[:20]!r}", where, "version 2", "unknown_version")
     for name in document.extensions_required:
@@ -221,8 +215,8 @@ class _Glb:
             if node.mesh is None:
                 continue
             if node.mesh >= len(meshes):
-                what = f"node {index} uses mesh {node.mesh}"
-                refuse(what, self.where, f"one of the {len(meshes)} meshes", "index_out_of_range")
+                allowed = f"one of the {len(meshes)} meshes"
+                refuse(f"node {index} uses mesh {node.mesh}", self.where, allowed, "index_out_of_range")
             if index not in T_scene_node:
                 what = f"node {index} has a mesh but is not in the scene"
                 refuse(what, self.where, "every mesh in the one scene", "mesh_not_placed")
@@ -272,9 +266,9 @@ class _Glb:
             found = self.document.accessors[accessor : accessor + 1] if accessor is not None else []
             return found[0].count if found else 0
 
-        count_of_parts = sum(len(self.document.meshes[mesh].primitives) for mesh in placed)
-        if count_of_parts > MAX_PARTS:
-            refuse(f"{count_of_parts} parts in all instances", self.where, f"at most {MAX_PARTS}", "too_many")
+        number_of_parts = sum(len(self.document.meshes[mesh].primitives) for mesh in placed)
+        if number_of_parts > MAX_PARTS:
+            refuse(f"{number_of_parts} parts in all instances", self.where, f"at most {MAX_PARTS}", "too_many")
         parts = [one for mesh in placed for one in self.document.meshes[mesh].primitives]
         corners = [count(one.attributes.get("POSITION")) for one in parts]
         used = [own if one.indices is None else count(one.indices) for one, own in zip(parts, corners, strict=True)]
@@ -307,20 +301,20 @@ class _Glb:
         if (accessor.component_type, accessor.type) != (_FLOAT, "VEC3"):
             refuse(f"POSITION of type {accessor.component_type} {accessor.type}", where, f"{_FLOAT} VEC3", "wrong_type")
         vertices = self._array(position, np.dtype("<f4"), 3, where).astype(np.float64)
-        indices = np.arange(len(vertices)) if primitive.indices is None else self._indices(primitive.indices, where)
+        indices = np.arange(len(vertices), dtype=np.int64)
+        if primitive.indices is not None:
+            accessor = self._accessor(primitive.indices, where)
+            if accessor.component_type not in _INDEX_TYPES or accessor.type != "SCALAR":
+                what = f"indices of type {accessor.component_type} {accessor.type}"
+                refuse(what, where, f"SCALAR of {list(_INDEX_TYPES)}", "wrong_type")
+            dtype = _INDEX_TYPES[accessor.component_type]
+            indices = self._array(primitive.indices, dtype, 1, where).reshape(-1).astype(np.int64)
         if len(indices) % 3 or len(indices) > 3 * MAX_TRIANGLES:
             what = f"{len(indices)} indices"
             refuse(what, where, f"three per triangle, at most {MAX_TRIANGLES} triangles", "wrong_count")
         if indices.max() >= len(vertices):
             refuse(f"index {indices.max()} out of range", where, f"0 to {len(vertices) - 1}", "index_out_of_range")
         return RawMesh(vertices, indices.reshape(-1, 3))
-
-    def _indices(self, index: int, where: str) -> Ints:
-        kind = self._accessor(index, where)
-        if kind.component_type not in _INDEX_TYPES or kind.type != "SCALAR":
-            what = f"indices of type {kind.component_type} {kind.type}"
-            refuse(what, where, f"SCALAR of {list(_INDEX_TYPES)}", "wrong_type")
-        return self._array(index, _INDEX_TYPES[kind.component_type], 1, where).reshape(-1).astype(np.int64)
 
     def _accessor(self, index: int, where: str) -> Accessor:
         if index >= len(self.document.accessors):

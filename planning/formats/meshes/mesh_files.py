@@ -4,14 +4,12 @@ Each format has its own strict reader, because a lost triangle makes a path "fre
 the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12 triangles: half an ASCII STL
 loads as 6, one misspelt ``vertex`` as 11, an ASCII PLY without its last line as 11, and relative OBJ indices put every
 face on the last vertices; none with an exception. The tests compare our readers with trimesh on whole files.
-`mesh_warnings` names triangles without area, open surfaces and inverted normals.
 
 STL: the binary form states its number of facets, so its size must fit to the byte. The ASCII form states nothing: every
-facet must be complete and the one solid must be closed by ``endsolid``.
-
-OBJ states no counts and has no end mark, so that a file cut between two face lines is itself a valid OBJ. What can be
-detected is refused: a last line without its end, a vertex that no face uses, fewer faces than a comment counts. What
-remains shows as an open mesh, of which ``mesh_warnings`` tells. Material files are never opened.
+facet must be complete and the one solid must be closed by ``endsolid``. OBJ states no counts and has no end mark, so
+that a file cut between two face lines is itself a valid OBJ. What can be detected is refused: a last line without its
+end, a vertex that no face uses, fewer faces than a comment counts. What remains shows as an open mesh, of which
+``mesh_warnings`` tells. Material files are never opened.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.base.files import decode_text, read_input
 from puncture_twin.planning.formats.guard import RawMesh, guard_mesh, triangulate
 from puncture_twin.planning.formats.meshes.ply import read_ply
@@ -49,9 +47,7 @@ def read_obj(data: bytes, where: str) -> RawMesh:
         what = "the last line has no line end: the file may be truncated"
         refuse(what, where, "a line end after every line", "file_cut")
     text = text.replace("\\\r\n", " ").replace("\\\n", " ")
-    vertices: list[tuple[float, float, float]] = []
-    corners: list[int] = []
-    counts: list[int] = []
+    vertices, corners, counts = list[tuple[float, float, float]](), list[int](), list[int]()
     for number, line in enumerate(text.split("\n"), start=1):
         tokens, place = line.split("#", 1)[0].split(), f"{where}, line {number}"
         if not tokens or tokens[0] in _IGNORED:
@@ -68,10 +64,9 @@ def read_obj(data: bytes, where: str) -> RawMesh:
         what = f"{unused} vertices are not used by any face: the face list may be truncated"
         allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
         refuse(what, where, allowed, "unused_vertices")
-    stated = sum(int(first or second) for first, second in _STATED_COUNT.findall(text))
-    if stated > len(counts):
-        what = f"comments state {stated} faces, but there are {len(counts)}"
-        refuse(what, where, "as many as stated", "size_mismatch")
+    stated, there = sum(int(first or second) for first, second in _STATED_COUNT.findall(text)), len(counts)
+    if stated > there:
+        refuse(f"comments state {stated} faces, but there are {there}", where, "as many as stated", "size_mismatch")
     return RawMesh(np.array(vertices, dtype=np.float64), faces)
 
 
@@ -101,10 +96,10 @@ _HEADER_BYTES = 84
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _BINARY_ALLOWED = "a binary STL of 84 + 50 n bytes, n as its header states it, at least 1"
 _ASCII_ALLOWED = "one solid of complete facets, closed by endsolid"
-_KEYWORDS = {0: "facet", 1: "normal", 5: "outer", 6: "loop", 7: "vertex", 11: "vertex", 15: "vertex"} | {
-    19: "endloop",
+_KEYWORDS = {
+    0: "facet", 1: "normal", 5: "outer", 6: "loop", 7: "vertex", 11: "vertex", 15: "vertex", 19: "endloop",
     20: "endfacet",
-}
+}  # fmt: skip
 _TOKENS_PER_FACET = 21
 _COORDINATE_TOKENS = [8, 9, 10, 12, 13, 14, 16, 17, 18]
 
@@ -121,8 +116,7 @@ def read_stl(data: bytes, where: str) -> RawMesh:
     if len(data) != needed or stated == 0:
         what = f"header states {stated} triangles, which take {needed} bytes, but the file has {len(data)}"
         refuse(what, where, _BINARY_ALLOWED, "size_mismatch")
-    facets = np.frombuffer(data, dtype=_FACET, offset=_HEADER_BYTES)
-    return _from_corners(facets["corners"].astype(np.float64))
+    return _from_corners(np.frombuffer(data, _FACET, offset=_HEADER_BYTES)["corners"].astype(np.float64))
 
 
 def _read_ascii(data: bytes, where: str) -> RawMesh:
@@ -134,23 +128,16 @@ def _read_ascii(data: bytes, where: str) -> RawMesh:
         refuse("several solids: a truncated file could lose some", where, _ASCII_ALLOWED, "several_solids")
     if len(tokens) == 0:
         refuse("the solid has no facet", where, _ASCII_ALLOWED, "empty")
-    wrong = [
-        (facet, place, found, keyword)
-        for place, keyword in _KEYWORDS.items()
-        for facet, found in enumerate(tokens[place::_TOKENS_PER_FACET])
-        if found != keyword
-    ]
-    if wrong:
-        facet, _, found, keyword = min(wrong)
-        refuse(f"facet {facet}: {found[:20]!r} instead of {keyword!r}", where, _ASCII_ALLOWED, "unknown_line")
+    for at, found in enumerate(tokens):
+        facet, place = divmod(at, _TOKENS_PER_FACET)
+        keyword = _KEYWORDS.get(place, found)
+        if found != keyword:
+            refuse(f"facet {facet}: {found[:20]!r} instead of {keyword!r}", where, _ASCII_ALLOWED, "unknown_line")
     if len(tokens) % _TOKENS_PER_FACET:
         refuse(f"facet {len(tokens) // _TOKENS_PER_FACET} is not complete", where, _ASCII_ALLOWED, "file_cut")
     columns = [tokens[column::_TOKENS_PER_FACET] for column in _COORDINATE_TOKENS]
-    try:
+    with refusing(ValueError, "a coordinate is not a number", where, _ASCII_ALLOWED, "not_a_number"):
         corners = np.array([[float(token) for token in column] for column in columns])
-    except ValueError as error:
-        what = f"a coordinate is not a number ({error})"
-        raise InputError(what, where=where, allowed=_ASCII_ALLOWED, code="not_a_number") from error
     return _from_corners(corners.T.reshape(-1, 3, 3))
 
 
@@ -184,13 +171,12 @@ def read_mesh(
 ) -> TriangleMesh:
     """One mesh file, checked against its own promises, in mm and LPS (or its own local frame).
 
-    The caller declares the unit, also for GLB, whose standard says metres, and the space. A file that Slicer wrote
-    states its space, which must be the declared one. All parts of a file become one surface, placed by their node
-    transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file whose y is up are rotated
-    about x, so that z is; of a GLB it must be stated.
+    A file that Slicer wrote states its space, which must be the declared one. All parts of a file become one surface,
+    placed by their node transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file
+    whose y is up are rotated about x, so that z is; of a GLB it must be stated.
 
     Args:
-        unit: The unit of its coordinates.
+        unit: Of its coordinates, also for GLB, whose standard says metres.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
         up: Its axis that is up in the file; without it, z of all but GLB.
 
@@ -214,23 +200,17 @@ def parse_mesh(
 ) -> TriangleMesh:
     """Parse a mesh file that has been read, like `read_mesh`; it is not opened again.
 
-    Args:
-        unit: The unit of its coordinates.
-        stretch: Shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
+    ``stretch``, shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
     """
-    name = str(path)
-    reader = _reader(path)
+    name, actual = str(path), space
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or NaN here, the guard refuses
-        in_text = _stated_space(data)
-        raw = reader(data, name)
-        stated = raw.space or in_text
-        actual = space
+        raw = _reader(path)(data, name)
+        stated = raw.space or _stated_space(data)
         if stated is not None and space_is_default and space is not Space.LOCAL:
             actual = stated
         elif stated not in (None, space) and (space is not Space.LOCAL or space_is_default):  # local is of its own
             allowed = 'space = "local" if intended' if space is Space.LOCAL else f'space = "{stated}"'
             refuse(f"the file states SPACE={stated}, the case {space}", name, allowed, "other_space")
-        # Points (n, 3) of a file, rotated by a quarter about x where its y is up
         if up is None and path.suffix.lower() == ".glb":
             allowed = 'up = "y" (rotated to z up) or up = "z" (kept as it is), or another format'
             refuse(UP_NOT_STATED, path, allowed, "up_not_stated")
@@ -253,7 +233,7 @@ class MeshExtent(NamedTuple):
 
 def mesh_extent(path: Path) -> MeshExtent:
     """The box of a mesh file in its own unit, and the space that it states; refused as by `read_mesh`."""
-    reader = _reader(path)
+    reader = _reader(path)  # an unknown ending is refused before anything is read
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     raw = reader(data, str(path))
     if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
@@ -291,10 +271,7 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
 
 
 def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
-    """`mesh_warnings` of each mesh, by name, from the cache for meshes seen before.
-
-    The meshes know then whether they are closed and wound alike, see `TriangleMesh.known`.
-    """
+    """`mesh_warnings` by name, from the cache for meshes seen before; all then have what `TriangleMesh.known` takes."""
     made_from = {"what": "mesh warnings", "meshes": [(name, mesh.digest) for name, mesh in meshes.items()]}
 
     def found() -> Arrays:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import RawMesh, token_array, triangulate
 
@@ -52,15 +52,10 @@ class _Lists(NamedTuple):
 
 
 _Columns = dict[str, NDArray[Any] | _Lists]
-"""Of an element, by property name."""
 
 
 def read_ply(data: bytes, where: str) -> RawMesh:
-    """The faces of a PLY file; polygons are cut into fans, other elements are passed over.
-
-    Raises:
-        InputError: If header and data do not fit each other, or there are no faces.
-    """
+    """The faces of a PLY file, polygons cut into fans. Raises InputError: header and data do not fit, or no face."""
     elements, body = _split(data, where)
     cursor = _Cursor(body, where)
     vertices: NDArray[np.float64] | None = None
@@ -98,7 +93,14 @@ def _split(data: bytes, where: str) -> tuple[list[_Element], bytes]:
         refuse(f"format {formats}", where, "one of " + ", ".join(_FORMATS), "unsupported_feature")
     is_ascii, body = formats[0] == "ascii", data[line_end + 1 :]
     elements = _elements(lines, _FORMATS[formats[0]], is_ascii=is_ascii, where=where)
-    return elements, _ascii_as_doubles(body, where) if is_ascii else body
+    if not is_ascii:
+        return elements, body
+    if not body.endswith(b"\n"):
+        what = "the last line has no line end: the file may be truncated"
+        refuse(what, where, "a line end after every line", "file_cut")
+    tokens = token_array(decode_text(body, where).split(), where)
+    with refusing(ValueError, "the data have no number", where, _ALLOWED, "not_a_number"):
+        return elements, tokens.astype("<f8").tobytes()
 
 
 def _elements(lines: list[list[str]], order: str, *, is_ascii: bool, where: str) -> list[_Element]:
@@ -128,18 +130,6 @@ def _elements(lines: list[list[str]], order: str, *, is_ascii: bool, where: str)
     return elements
 
 
-def _ascii_as_doubles(body: bytes, where: str) -> bytes:
-    if not body.endswith(b"\n"):
-        what = "the last line has no line end: the file may be truncated"
-        refuse(what, where, "a line end after every line", "file_cut")
-    tokens = token_array(decode_text(body, where).split(), where)
-    try:
-        return tokens.astype("<f8").tobytes()
-    except ValueError as error:
-        what = f"the data have no number ({error})"
-        raise InputError(what, where=where, allowed=_ALLOWED, code="not_a_number") from error
-
-
 @dataclass
 class _Cursor:
     """Takes element after element from the body."""
@@ -155,9 +145,7 @@ class _Cursor:
         if smallest * element.rows > left:
             what = f"{element.rows} x {element.name} take at least {smallest * element.rows} bytes, but {left} are left"
             refuse(what, self.where, _ALLOWED, "file_cut")
-        if element.rows == 0:
-            return {}
-        return self._take_even(element) or self._take_row_by_row(element)
+        return (self._take_even(element) or self._take_row_by_row(element)) if element.rows else {}
 
     def _length(self, prop: _Property, position: int) -> tuple[int, int]:
         """How many numbers a property has at a position, and where they start."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.formats.guard import MAX_TOKEN_LENGTH, MAX_TRIANGLES, MAX_VERTICES, RawMesh, triangulate
 
 _ALLOWED = "a legacy VTK file, ASCII or BINARY, of DATASET POLYDATA whose points and polygons are as many as it states"
@@ -38,11 +38,7 @@ class _Polygons(NamedTuple):
 
 
 def read_vtk(data: bytes, where: str) -> RawMesh:
-    """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface.
-
-    Raises:
-        InputError: If it is cut, of another kind, has fewer numbers than it states, or holds triangle strips.
-    """
+    """The polygons of a legacy VTK file, cut into fans. Raises InputError: cut, too few numbers, or triangle strips."""
     cursor = _Cursor(data, where)
     version = _VERSION.fullmatch(cursor.line())
     cursor.line()  # the title, which anything may be
@@ -153,8 +149,7 @@ class _Cursor:
     def words(self) -> list[str]:
         """Words of the next line that is not empty; none at the end of the file."""
         while self._at < len(self._data):
-            line = self.line().strip()
-            if line:
+            if line := self.line().strip():
                 return line.decode("ascii", "replace").split()
         return []
 
@@ -190,8 +185,5 @@ class _Cursor:
             refuse(f"{len(words)} numbers instead of {count}", self._where, _ALLOWED, "size_mismatch")
         if self._at > len(self._data):  # its last number may be the beginning of one
             refuse("the last line has no end: the file is cut", self._where, _ALLOWED, "file_cut")
-        try:
+        with refusing((ValueError, OverflowError), "not a number", self._where, _ALLOWED, "not_a_number"):
             return np.array(words, dtype=np.bytes_).astype(dtype)
-        except (ValueError, OverflowError) as error:
-            what = f"not a number ({error})"
-            raise InputError(what, where=self._where, allowed=_ALLOWED, code="not_a_number") from error

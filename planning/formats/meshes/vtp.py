@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.formats.guard import MAX_TRIANGLES, MAX_VERTICES, RawMesh, join, token_array, triangulate
 from puncture_twin.planning.geometry.spaces import Space
 
@@ -30,18 +30,13 @@ _HEADER_TYPES = {"UInt32": "u4", "UInt64": "u8"}
 
 
 def read_vtp(data: bytes, where: str) -> RawMesh:
-    """The polygons of a VTP file; polygons are cut into fans; points and lines in it carry no surface.
-
-    Raises:
-        InputError: If it is cut, an array is shorter or longer than stated, or it holds triangle strips.
-    """
+    """The polygons of a VTP file, cut into fans. Raises InputError: cut, arrays of another length, or strips."""
     written, appended = _split_appended(data, where)
     if b"<!" in written.replace(b"<!--", b""):
         refuse("a document type or CDATA section", where, "VTK's own XML, without either", "xml_doctype")
-    try:
+    kinds = (ElementTree.ParseError, ValueError, LookupError)  # no XML, or an unknown text encoding
+    with refusing(kinds, "XML cannot be read", where, _ALLOWED, "xml_damaged"):
         root = ElementTree.fromstring(written)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # no XML, or an unknown text encoding
-        raise InputError(f"XML cannot be read ({error})", where=where, allowed=_ALLOWED, code="xml_damaged") from error
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         refuse(f"{root.tag} of type {root.get('type')}", where, _ALLOWED, "wrong_format")
     section = root.find("AppendedData")
@@ -55,10 +50,8 @@ def read_vtp(data: bytes, where: str) -> RawMesh:
         refuse(f"compressor {compressor!r}", where, "none or vtkZLibDataCompressor", "unsupported_feature")
     header_type, compressed = np.dtype(_BYTE_ORDERS[order] + _HEADER_TYPES[header]), _COMPRESSORS[compressor]
     encoding = Encoding(_BYTE_ORDERS[order], header_type, compressed, appended, appended_form == "base64")
-    pieces = root.findall("PolyData/Piece")
-    parts = [_piece(piece, encoding, f"{where}, piece {i}") for i, piece in enumerate(pieces)]
-    filled = [part for part in parts if part is not None]
-    if not filled:
+    parts = [_piece(one, encoding, f"{where}, piece {i}") for i, one in enumerate(root.findall("PolyData/Piece"))]
+    if not (filled := [part for part in parts if part is not None]):
         refuse("no polygon in any piece", where, _ALLOWED, "empty")
     return join(filled)._replace(space=_space(root, encoding, where))
 
@@ -192,29 +185,26 @@ def _stream(element: ElementTree.Element, form: str, encoding: Encoding, where: 
 
 
 def _from_text(text: str, dtype: np.dtype[Any], where: str) -> NDArray[Any]:
-    try:
+    what = f"not a number of type {dtype}"
+    with refusing((ValueError, OverflowError), what, where, _ALLOWED_ARRAYS, "not_a_number"):
         if dtype.kind == "f":
             return token_array(text.split(), where).astype(np.float64)
         return np.array([int(token) for token in text.split()], dtype=dtype)
-    except (ValueError, OverflowError) as error:
-        what = f"not a number of type {dtype} ({error})"
-        raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="not_a_number") from error
 
 
 def _from_binary(stream: _Stream, size: int, encoding: Encoding, where: str) -> bytes:
+    """Header: the size; of blocks their number, the size of one, of the last if it is partial, and each compressed."""
+    header_type, step = encoding.header_type, encoding.header_type.itemsize
+    first = int(np.frombuffer(_take(stream, 0, step, where), header_type)[0])
     if encoding.compressed:
-        return _decompressed(stream, size, encoding.header_type, where)
-    header = encoding.header_type.itemsize
-    stated = int(np.frombuffer(_take(stream, 0, header, where), encoding.header_type)[0])
-    if stated != size:
-        refuse(f"array of {stated} bytes instead of {size}", where, _ALLOWED_ARRAYS, "size_mismatch")
-    return _take(stream, 0, header + size, where)[header:]
+        return _decompressed(stream, size, first, header_type, where)
+    if first != size:
+        refuse(f"array of {first} bytes instead of {size}", where, _ALLOWED_ARRAYS, "size_mismatch")
+    return _take(stream, 0, step + size, where)[step:]
 
 
-def _decompressed(stream: _Stream, size: int, header_type: np.dtype[Any], where: str) -> bytes:
-    """Header: number of blocks, size of a block, of the last one if it is partial, then each compressed size."""
+def _decompressed(stream: _Stream, size: int, n_blocks: int, header_type: np.dtype[Any], where: str) -> bytes:
     step = header_type.itemsize
-    n_blocks = int(np.frombuffer(_take(stream, 0, step, where), header_type)[0])
     if n_blocks > len(stream.data) or (n_blocks == 0) != (size == 0):
         refuse(f"{n_blocks} compressed blocks", where, _ALLOWED_ARRAYS, "size_mismatch")
     header = np.frombuffer(_take(stream, 0, (3 + n_blocks) * step, where), header_type)
@@ -224,45 +214,32 @@ def _decompressed(stream: _Stream, size: int, header_type: np.dtype[Any], where:
         sizes[-1] = last
     if sum(sizes) != size:
         refuse(f"blocks of {sum(sizes)} bytes instead of {size}", where, _ALLOWED_ARRAYS, "size_mismatch")
-    start = _encoded_length(len(header) * step) if stream.base64 else len(header) * step
-    body = _take(stream, start, sum(packed), where)
+    body = _take(stream, _stored_length(stream, len(header) * step), sum(packed), where)
     out, position = [], 0
     for expected, length in zip(sizes, packed, strict=True):
-        out.append(_inflate(body[position : position + length], expected, where))
+        unpacker = zlib.decompressobj()
+        with refusing(zlib.error, "compressed block is damaged", where, _ALLOWED_ARRAYS, "file_damaged"):
+            out.append(unpacker.decompress(body[position : position + length], expected + 1))  # no bomb is inflated
+        if len(out[-1]) != expected or not unpacker.eof:
+            what = f"compressed block of {len(out[-1])} bytes instead of {expected}, or cut"
+            refuse(what, where, _ALLOWED_ARRAYS, "size_mismatch")
         position += length
     return b"".join(out)
 
 
-def _inflate(data: bytes, size: int, where: str) -> bytes:
-    """One block of zlib, never more bytes than stated."""
-    unpacker = zlib.decompressobj()
-    try:
-        block = unpacker.decompress(data, size + 1)
-    except zlib.error as error:
-        what = f"compressed block is damaged ({error})"
-        raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="file_damaged") from error
-    if len(block) != size or not unpacker.eof:
-        what = f"compressed block of {len(block)} bytes instead of {size}, or cut"
-        refuse(what, where, _ALLOWED_ARRAYS, "size_mismatch")
-    return block
-
-
-def _encoded_length(size: int) -> int:
-    return 4 * ((size + 2) // 3)
+def _stored_length(stream: _Stream, size: int) -> int:
+    return 4 * ((size + 2) // 3) if stream.base64 else size
 
 
 def _take(stream: _Stream, start: int, size: int, where: str) -> bytes:
     """Decoded bytes; in base64 they start a group of their own at character ``start``."""
-    end = start + (_encoded_length(size) if stream.base64 else size)
+    end = start + _stored_length(stream, size)
     if end > len(stream.data):
         refuse(f"array data end at byte {len(stream.data)} of {end}", where, _ALLOWED_ARRAYS, "file_cut")
     if not stream.base64:
         return stream.data[start:end]
-    try:
+    with refusing(binascii.Error, "base64 data is damaged", where, _ALLOWED_ARRAYS, "file_damaged"):
         decoded = base64.b64decode(stream.data[start:end], validate=True)
-    except binascii.Error as error:
-        what = f"base64 data is damaged ({error})"
-        raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="file_damaged") from error
     if len(decoded) < size:
         refuse(f"base64 data of {len(decoded)} bytes instead of {size}", where, _ALLOWED_ARRAYS, "size_mismatch")
     return decoded[:size]

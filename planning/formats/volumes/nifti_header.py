@@ -33,8 +33,6 @@ PIXDIM_TOLERANCE = 1e-3
 LPS_FROM_RAS = np.array([[-1.0], [-1.0], [1.0], [1.0]])
 """Factors of the rows of an affine."""
 PLAIN = "a single-file NIfTI-1 (.nii, .nii.gz) with 3 axes"
-
-
 LAYOUT = "40x8h14x2h2x8f3f3xB128x2h6f12f20x"
 """The fields of `_Fields` among those that do not matter, by `struct`."""
 
@@ -58,16 +56,12 @@ class _Fields(NamedTuple):
 
 
 def parse_nifti_header(content: bytes, path: Path) -> volume_header.VolumeHeader:
-    """What the header of a file says; of a .nii.gz no more than the header is inflated.
+    """What the header of a file says; of a .nii.gz no more is inflated. Raises InputError: whatever is wrong with it.
 
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
     (SimpleITK takes the sform if its code is 1, else the qform).
-
-    Raises:
-        InputError: Whatever is wrong with the header.
     """
-    compressed = path.name.lower().endswith(".gz")
-    head = content[:HEADER_BYTES]
+    compressed, head = path.name.lower().endswith(".gz"), content[:HEADER_BYTES]
     if compressed:
         head = volume_header.first_bytes(memoryview(content), HEADER_BYTES, where=path, allowed=PLAIN)
     fields = _parse(head, path)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.base.files import absence, is_plain_file
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, VoxelLayout, check_affine, check_shape
 
@@ -46,12 +46,9 @@ def split_header(content: bytes, path: Path) -> NrrdText:
     end = re.search(rb"\n\r?\n", head)
     if end is None and len(head) == MAX_HEADER_BYTES:
         refuse("the header has no end", path, f"at most {MAX_HEADER_BYTES} bytes", "bad_header")
-    try:
+    with refusing(UnicodeDecodeError, "the header is not text", path, "UTF-8", "not_text"):
         lines = head[: end.start() if end else None].decode("utf-8").split("\n")[1:]
-    except UnicodeDecodeError as error:
-        raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8", code="not_text") from error
-    fields: dict[str, str] = {}
-    remarks: dict[str, str] = {}
+    fields, remarks = dict[str, str](), dict[str, str]()
     for number, line in enumerate((text.rstrip("\r") for text in lines), start=2):
         where = f"{path}, line {number}"
         if line.startswith("#") or not line:
@@ -156,11 +153,7 @@ def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
 
 
 def is_layered(content: bytes, path: Path) -> bool:
-    """Whether a file has a fourth axis, of layers: one of Slicer's segmentations whose segments overlap.
-
-    Raises:
-        InputError: No NRRD header.
-    """
+    """Whether a file has a fourth axis, of Slicer's layers of overlapping segments. Raises InputError: no NRRD."""
     return _without_last(split_header(content, path)).fields.get("dimension") == "4"
 
 
@@ -201,11 +194,7 @@ def _header(raw: NrrdText, path: Path, layers: int = 1) -> VolumeHeader:
 
 
 def data_file(content: bytes, path: Path) -> str | None:
-    """The name of the file beside a detached header that holds its data; None where header and data are one file.
-
-    Raises:
-        InputError: A damaged header, or data elsewhere than in the file or beside it.
-    """
+    """The file beside a detached header with its data, by name, or None. Raises InputError: damaged, or elsewhere."""
     raw = split_header(content, path)
     return None if raw.data_path == path else raw.data_path.name
 
@@ -235,10 +224,8 @@ def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
     rows = VECTOR.findall(text)
     if len(rows) != count or VECTOR.sub("", text).strip():
         refuse(f"{text[:80]!r}", path, allowed, "not_a_number")
-    try:
+    with refusing(ValueError, f"{text[:80]!r}", path, allowed, "not_a_number"):
         vectors = np.array([[float(cell) for cell in row.split(",")] for row in rows])
-    except ValueError as error:
-        raise InputError(f"{text[:80]!r} ({error})", where=path, allowed=allowed, code="not_a_number") from error
     if vectors.shape != (count, 3):
         refuse(f"{text[:80]!r}", path, allowed, "not_a_number")
     return vectors

@@ -1,12 +1,8 @@
-"""Volumes from NIfTI and NRRD files: voxels, and where they lie in LPS mm.
+"""Volumes from NIfTI and NRRD files: voxels, where they lie in LPS mm, and one order of their axes.
 
 General readers fill a truncated file with zeros, turn NaN into 0, load a NaN affine and follow a header to any file of
 the machine. So headers and voxels are read here, from the bytes that were hashed: what a header promises is held
 against what is there, and nothing is inflated beyond it. The tests hold every value against SimpleITK.
-
-A volume before its voxels are decoded: which files it is made of, where it lies, and how to get the voxels.
-
-One array order for every volume: axis 0 runs mostly to the patient's left, 1 to the back, 2 to the head.
 """
 
 from __future__ import annotations
@@ -60,11 +56,7 @@ class Volume(Shown):
 
 
 def data_file(content: bytes, path: Path) -> str | None:
-    """The name of the file beside this one that holds its voxels; None for a volume in one file.
-
-    Raises:
-        InputError: A header that is damaged, or names data elsewhere.
-    """
+    """The name of the file beside this one with its voxels, or None. Raises InputError: damaged, or data elsewhere."""
     return nrrd_header.data_file(content, path) if path.name.lower().endswith(NRRD_ENDINGS) else None
 
 
@@ -77,9 +69,7 @@ def read_volume(path: Path) -> Volume:
     """A volume from .nii, .nii.gz, .nrrd, .nhdr (data beside it) or .seg.nrrd, in LPS mm.
 
     NIfTI is RAS and turned here; NRRD says its space. Units of metre and micrometre in NIfTI become mm.
-
-    Raises:
-        InputError: Anything wrong with the file; nothing else comes out, whatever its bytes.
+    Raises InputError: anything wrong with the file; nothing else comes out, whatever its bytes.
     """
     if not is_plain_file(path):
         refuse(f"the file {absence(path)}", path, "a volume file", "no_such_file")
@@ -108,12 +98,9 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
 
 def _parser(path: Path) -> Callable[[bytes, Path], volume_header.VolumeHeader]:
     name = path.name.lower()
-    if name.endswith(NIFTI_ENDINGS):
-        return parse_nifti_header
-    if name.endswith(NRRD_ENDINGS):
-        return parse_nrrd_header
-    what = "unknown file ending"
-    raise InputError(what, where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS), code="unknown_format")
+    if not name.endswith(NIFTI_ENDINGS + NRRD_ENDINGS):
+        refuse("unknown file ending", path, ", ".join(NIFTI_ENDINGS + NRRD_ENDINGS), "unknown_format")
+    return parse_nifti_header if name.endswith(NIFTI_ENDINGS) else parse_nrrd_header
 
 
 def _scaled(stored: NDArray[Any], cells: volume_header.VoxelLayout) -> NDArray[Any]:
@@ -209,14 +196,10 @@ def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
 
 
 def canonical(values: NDArray[Any], T_ct_index: NDArray[np.float64]) -> Oriented:
-    """The voxels with their axes permuted and flipped so that they run along +L, +P, +S as nearly as can be.
+    """Voxels (ni, nj, nk), index to LPS mm (4, 4), with axes permuted and flipped to run nearly along +L, +P, +S.
 
     What an algorithm makes of a volume may depend on the array's order (ambiguous cells of marching cubes do);
     after this step it cannot depend on how the file stored it.
-
-    Args:
-        values: Shape (ni, nj, nk).
-        T_ct_index: Shape (4, 4), maps index (i, j, k) to LPS mm.
     """
     axes = T_ct_index[:3, :3] / np.linalg.norm(T_ct_index[:3, :3], axis=0)
     order = max(itertools.permutations(range(3)), key=lambda p: sum(abs(axes[row, p[row]]) for row in range(3)))
@@ -228,5 +211,4 @@ def canonical(values: NDArray[Any], T_ct_index: NDArray[np.float64]) -> Oriented
         T_index_oriented[axis, row] = -1.0 if backward else 1.0
         T_index_oriented[axis, 3] = values.shape[axis] - 1 if backward else 0
         flips.append(slice(None, None, -1 if backward else 1))
-    T_ct_oriented = T_ct_index @ T_index_oriented
-    return Oriented(values.transpose(order)[tuple(flips)], T_ct_oriented)
+    return Oriented(values.transpose(order)[tuple(flips)], T_ct_index @ T_index_oriented)

@@ -1,7 +1,4 @@
-"""The checked header of a volume: its shape, its cells' type and size, and where its voxels lie.
-
-The stored voxels, from the bytes of its file, raw or gzipped.
-"""
+"""The checked header of a volume: its shape, its cells' type and size, where its voxels lie; and the stored voxels."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import InputError, refuse, refusing
 from puncture_twin.planning.geometry.rigid import apply
 
 MAX_VOXELS = 1_000_000_000
@@ -87,14 +84,7 @@ def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:
 
 
 def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.float64]:
-    """The affine, read-only, if it is finite, regular, without shear and of plausible spacing and origin.
-
-    Args:
-        T_ct_index: Shape (4, 4), maps voxel index to mm.
-
-    Raises:
-        InputError: Named: not finite, zero or singular, implausible spacing, sheared, implausible origin.
-    """
+    """The affine (4, 4), voxel index to mm, read-only. Raises InputError: not finite, singular or implausible."""
     T = np.array(T_ct_index, dtype=np.float64)
     if not np.isfinite(T).all():
         refuse("the affine has NaN or infinity", where, "finite numbers", "not_finite")
@@ -119,12 +109,11 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
 
 def corner_deviation_mm(T_a: NDArray[np.float64], T_b: NDArray[np.float64], shape: tuple[int, int, int]) -> float:
     """Largest distance between where two affines place a corner of the volume, mm."""
-    difference = T_a - T_b
-    return float(np.linalg.norm(apply(difference, _corners(shape)), axis=1).max())
+    return float(np.linalg.norm(apply(T_a - T_b, _corners(shape)), axis=1).max())
 
 
 def _corners(shape: tuple[int, int, int]) -> NDArray[np.float64]:
-    """The voxels at the corners of a volume, shape (8, 3)."""
+    """Shape (8, 3)."""
     return np.array(list(itertools.product(*((0, n - 1) for n in shape))), dtype=np.float64)
 
 
@@ -158,18 +147,10 @@ PART_BYTES = 1 << 20
 
 
 def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.uint8]:
-    """Inflate gzip data, which may have several members one after the other, padded with zeros.
+    """Inflate gzip data of one or several members, padded with zeros, to the ``promised`` bytes, shape (promised,).
 
-    Stops one byte after the promised length, so what a bomb would inflate to is never made.
-
-    Args:
-        promised: Bytes that the header says they inflate to.
-
-    Returns:
-        Shape (promised,).
-
-    Raises:
-        InputError: Damaged, truncated, or of another length.
+    Stops one byte after them, so what a bomb would inflate to is never made. Raises InputError: damaged, truncated, or
+    of another length.
     """
     if promised > len(content) * DEFLATE_RATIO:
         what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header states"
@@ -190,11 +171,8 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
 
 def first_bytes(content: memoryview, count: int, *, where: Path, allowed: str) -> bytes:
     """The first bytes that gzip data inflate to; fewer where there are no more. Raises InputError: damaged there."""
-    try:
+    with refusing((EOFError, zlib.error), "not a readable gzip file", where, allowed, "file_damaged"):
         return b"".join(_parts(content, count))
-    except (EOFError, zlib.error) as error:
-        what = f"not a readable gzip file ({error})"
-        raise InputError(what, where=where, allowed=allowed, code="file_damaged") from error
 
 
 def _parts(content: memoryview, most: int) -> Iterator[bytes]:
@@ -218,13 +196,10 @@ def _parts(content: memoryview, most: int) -> Iterator[bytes]:
 
 
 def decoded(content: memoryview, header: VolumeHeader) -> NDArray[Any]:
-    """The voxels as stored, in this machine's byte order.
+    """The voxels as stored, in this machine's byte order. Raises InputError: damaged, or not as long as it states.
 
     Returns:
         Shape (ni, nj, nk), axis i running fastest in memory; (layers, ni, nj, nk) where there are several layers.
-
-    Raises:
-        InputError: The data are damaged, or shorter or longer than the header says.
     """
     cells, where = header.cells, header.data_path
     data, count = content[cells.start :], header.count * header.layers

@@ -196,13 +196,13 @@ def calibrate(
 ) -> CameraCalibration:
     """Calibrate one camera (Liu 2007, section 2, with a refinement that the paper does not have).
 
-    Points (n, 3), mm, n >= 6, are not in a plane; the pixels (n, 2) are where they were found, in an image of a size
-    (width, height). Errors call them by their names, or number them from 1. Without distortion the lens is perfect, as
-    the paper has it.
+    Points (n, 3), mm, n >= 6, are not in a plane; the pixels (n, 2), finite, are where they were found, in an image of
+    a size (width, height). Errors call them by their names, or number them from 1. Without distortion the lens is
+    perfect, as the paper has it.
 
     Raises:
-        InputError: Too few points, points in a plane or twice, a point behind the camera or that
-            does not fit, a set that leaves the camera free.
+        InputError: Too few points, points in a plane or twice, a point behind the camera or that does not fit, a set
+            that leaves the camera free.
     """
     points, pixels = np.asarray(points_c, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
     names = [f"point {i + 1}" for i in range(len(points))] if names is None else names

@@ -92,9 +92,9 @@ def acquire(
     left = np.arange(len(candidates.q_probe))
     while len(shots) < wanted:
         if wanted - len(shots) > len(left):
+            shown = f"{len(shots)} of {wanted} poses show the needle. Of {len(candidates.q_probe)} candidates"
             lacking = f"{len(missed)} did not show it and {given_up.total()} were given up"
-            what = f"{len(shots)} of {wanted} poses show the needle. Of {len(candidates.q_probe)} candidates, {lacking}"
-            what += ". More [poses] samples would help"
+            what = f"{shown}, {lacking}. More [poses] samples would help"
             raise NoAnswerError(what, counts=candidates.counts, code="too_few_poses")
         chosen = choose(case, candidates, left, wanted - len(shots), rng, shots)
         left = np.setdiff1d(left, chosen)

@@ -37,7 +37,7 @@ def cut_solids(
 
     Triangles of all solids, corners (m, 3, 3) in voxels (centres are whole), belong to their owners (m,). Solids are
     filled (n,), later ones in the place of earlier ones, and labelled (layers, n) in each map, 0 where it does not show
-    them. The voxels' spacing (3,) says how many lines there are.
+    them; ``empty`` is where no solid is. The voxels' spacing (3,) says how many lines there are.
     """
     nx, ny, nz = shape
     lines, planes = (max(LEAST_LINES, 2 * int(np.ceil(mm / LINE_MM / 2)) + 1) for mm in spacing_mm[1:])
