@@ -1,15 +1,22 @@
-"""Checkers of arms that many tests share: what encloses the bodies of an arm and its tool is made once a process."""
+"""Checkers of arms that many tests share: what encloses the bodies of an arm and its tool is made once a run."""
 
+from dataclasses import replace
+from functools import cache
 from typing import Any, TypeVar
 
-from puncture_twin.planning.base.cache.array_cache import Cache, Memory
+from puncture_twin.planning.base.cache.array_cache import Cache, Memory, user_cache
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 
 Kind = TypeVar("Kind", bound=CellChecker)
-ENCLOSURES = Cache(None, memory=Memory(10**9))
+
+
+@cache
+def enclosures() -> Cache:
+    """The folder that all processes of a run share, and this one's memory."""
+    return replace(user_cache(), memory=Memory(10**9))
 
 
 def built(kind: type[Kind], *arguments: Any, **named: Any) -> Kind:
     """A checker of a kind, from its own arguments."""
-    return kind(*arguments, **named, **({"cache": ENCLOSURES} if kind is FastChecker else {}))
+    return kind(*arguments, **named, **({"cache": enclosures()} if kind is FastChecker else {}))

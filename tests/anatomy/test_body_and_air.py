@@ -320,9 +320,9 @@ def test_an_obstacle_stops_the_needle_without_an_arm_too(scene, usual, name, y, 
 
 
 def test_a_certificate_holds_outside_of_the_body_too(usual):
-    """Between the grid points: no cell that is proven safe holds a direction that the search refuses."""
+    """Between the grid points: no cell that is proven safe holds a direction that the search refuses; on one side."""
     _, context, found = usual("all")
-    certificate = certify(context.case, context.anatomy, size=np.radians(6.0))
+    certificate = certify(context.case, context.anatomy, size=np.radians(6.0), beta=(0, np.pi))
     verify(certificate, context.case, context.anatomy)
     low_theta, high_theta = certificate.leaves.theta.T
     low_beta, high_beta = certificate.leaves.beta.T

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import gzip
-import json
 import os
-import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from case_world import ORGAN, case_text, image_of, registration_section, structu
 from puncture_twin.planning.base.provenance import differing_input, inputs_document
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.plant.truth import draw_truth
 
 CASE = case_text(
     structure("skin", "skin", {"ct": "ct.nhdr"}),
@@ -136,26 +136,19 @@ def test_one_changed_byte_of_any_file_changes_its_hash_alone(folder: Path) -> No
         (folder / name).write_bytes(content)
 
 
-OPENS = """
-import json, os, sys
-from collections import Counter
-folder, opened = sys.argv[1], Counter()
-def hook(event, arguments):
-    if event == "open" and isinstance(arguments[0], str) and arguments[0].startswith(folder):
-        opened[os.path.relpath(arguments[0], folder)] += 1
-sys.addaudithook(hook)
-from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.plant.truth import draw_truth
-context = prepare(folder)
-draw_truth(context.case, context.placement.T_base_ct)
-print(json.dumps(opened))
-"""
-
-
-def test_each_file_is_opened_once(folder: Path, tmp_path: Path) -> None:
+def test_each_file_is_opened_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So no file can be swapped between hashing and parsing; with an empty and with a full cache, the arm included."""
-    environment = os.environ | {"PUNCTURE_TWIN_CACHE": str(tmp_path / "cache")}
+    monkeypatch.setenv("PUNCTURE_TWIN_CACHE", str(tmp_path / "cache"))
+    opened: Counter[str] = Counter()
+
+    def hook(event: str, arguments: tuple[object, ...]) -> None:
+        if event == "open" and isinstance(arguments[0], str) and arguments[0].startswith(str(folder)):
+            opened[os.path.relpath(arguments[0], folder)] += 1
+
+    sys.addaudithook(hook)
     for _ in range(2):
-        command = [sys.executable, "-c", OPENS, str(folder)]
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        assert json.loads(run.stdout) == {path: 1 for _, path in ROLES}
+        opened.clear()
+        context = prepare(folder)
+        assert context.placement is not None
+        draw_truth(context.case, context.placement.T_base_ct)
+        assert opened == {path: 1 for _, path in ROLES}

@@ -24,7 +24,7 @@ DRAWN = 400
 @pytest.fixture(scope="module")
 def certified():
     context = prepare(folder() / "abdomen")
-    size = np.radians(2.0)
+    size = np.radians(3.0)
     plain = certify(context.case, context.anatomy, size=size)
     found = certify(context.case, context.anatomy, size=size, touch=CHANCE, error=context.pose_error)
     return context, plain, found
@@ -132,7 +132,8 @@ MANY = 100_000
 def drawn_clearances(pose, surface_mm, freedom, rng):
     """How far needles come off the axis of a tube that ends at `TUBE_MM`, by exact rotations, (MANY,), mm.
 
-    The pose errs as much as the bounds allow, and as badly: positions and directions go the same way.
+    The pose errs as much as the bounds allow, and as badly: positions and directions go the same way. A line is
+    farthest from the axis at an end: its tip, or where it leaves the tube.
     """
     scale = 1.0 if freedom is None else np.sqrt(freedom / rng.chisquare(freedom, MANY))[:, None]
     d = rng.normal(0.0, pose.deviation_mm, (MANY, 3))
@@ -140,12 +141,11 @@ def drawn_clearances(pose, surface_mm, freedom, rng):
     if pose.deviation_mm and pose.deviation_rad:  # fully correlated: the tip goes where the needle leans
         phi = d[:, :2] * pose.deviation_rad / pose.deviation_mm
     d, phi = d * scale, phi * scale
-    depth = np.linspace(0.0, NEEDLE_MM, 301)
-    lean = np.linalg.norm(phi, axis=1)
-    side = phi / np.maximum(lean, 1e-300)[:, None]
-    z = d[:, 2, None] + depth * np.cos(lean)[:, None]
-    across = np.hypot(*(d[:, k, None] + depth * (np.sin(lean) * side[:, k])[:, None] for k in (0, 1)))
-    most = np.where(z <= TUBE_MM, across, 0.0).max(axis=1)
+    lean = np.linalg.norm(phi, axis=1, keepdims=True)
+    side = phi / np.maximum(lean, 1e-300)
+    depth = np.clip((TUBE_MM - d[:, 2:]) / np.cos(lean), 0.0, NEEDLE_MM)
+    ends = d[:, :2], d[:, :2] + depth * np.sin(lean) * side
+    most = np.max([np.linalg.norm(end, axis=1) for end in ends], axis=0)
     return most + np.abs(rng.normal(0.0, surface_mm, MANY) * (1.0 if freedom is None else scale[:, 0]))
 
 

@@ -1,6 +1,7 @@
 """The fast checker: bounds that never exceed the distance, balls that enclose, and verdicts that are FCL's."""
 
 import shutil
+from functools import cache
 from itertools import pairwise
 
 import fcl
@@ -47,6 +48,7 @@ def points_within(corners, count, rng):
     return np.einsum("ij,ijk->ik", weights, chosen)
 
 
+@cache
 def scene(kind, padding_mm=5.0):
     """A UR3 beside a lumpy patient on a table that is not square to the base, with a lamp above."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
@@ -536,8 +538,8 @@ def test_a_checker_from_the_cache_is_no_other_kind_to_its_kernels(tmp_path):
     ball = trimesh.creation.icosphere(2, 100.0)
     patient = TriangleMesh(np.asarray(ball.vertices) + [600.0, 0.0, 0.0], np.asarray(ball.faces))
     kinds = [
-        typeof(FastChecker(UR3, TOOL, [], patient, padding_mm=5.0, cache=cache)._proofs.scene)
-        for cache in (NO_CACHE, Cache(tmp_path), Cache(tmp_path))
+        typeof(FastChecker(UR3, TOOL, [], patient, padding_mm=5.0, cache=kept)._proofs.scene)
+        for kept in (NO_CACHE, Cache(tmp_path), Cache(tmp_path))
     ]
     assert kinds[0] == kinds[1] == kinds[2]
 

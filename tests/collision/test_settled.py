@@ -1,5 +1,7 @@
 """What is settled without the reference, as FCL has it: a round body against triangles, and overlaps that are deep."""
 
+from functools import cache
+
 import fcl
 import numpy as np
 import trimesh
@@ -40,6 +42,7 @@ def surfaces():
     return skin, TriangleMesh(slab.vertices + [380.0, 0.0, 40.0], np.asarray(slab.faces))
 
 
+@cache
 def cell(kind):
     """Both, with a box, around a UR3."""
     skin, outside = surfaces()

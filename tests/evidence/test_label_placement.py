@@ -1,5 +1,7 @@
 """Structures that are not of their image are refused, warned of, or said to be open; those that are, never refused."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from placed_trunk import PHANTOMS, moved, write_trunk
@@ -13,6 +15,23 @@ from puncture_twin.planning.evidence.label_placement import REFUSING_Z, STRUCTUR
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.context import prepare
 
+needs_scans = pytest.mark.skipif(
+    not (DATA / "slicer_chest_ct4").is_dir(), reason="the real scans are not on this machine"
+)
+
+
+@cache
+def scans():
+    """The real patients, by name."""
+    return dict(real(DATA))
+
+
+@cache
+def seen(name):
+    """A phantom or a real patient, the edges of the image, and the structures as they lie."""
+    patient = PHANTOMS[name] if name in PHANTOMS else scans()[name]
+    return patient, edge_image(patient.hu, patient.T), source_of(patient, meshes_of(patient))
+
 
 def about(point, linear):
     """The affine map (4, 4) that leaves a point in place."""
@@ -25,8 +44,7 @@ def about(point, linear):
 def test_slips_are_found_and_true_placements_pass(name):
     """Of three seeded slips none passes in silence. In noise, cropped, on thick slices the true is not doubted."""
     rng = np.random.default_rng(2)
-    patient = PHANTOMS[name]
-    image, source = edge_image(patient.hu, patient.T), source_of(patient, meshes_of(patient))
+    patient, image, source = seen(name)
     for _ in range(3):
         kind, T = wrong(source, rng)
         found = assess(image, source_of(patient, {n: mesh.transformed(T) for n, mesh in source.meshes.items()}))
@@ -37,12 +55,11 @@ def test_slips_are_found_and_true_placements_pass(name):
         assert found.z < WARNING_Z, (change, found)
 
 
-@pytest.mark.skipif(not (DATA / "slicer_chest_ct4").is_dir(), reason="the real scans are not on this machine")
+@needs_scans
 @pytest.mark.parametrize("name", ["abdomen", "chest"])
 def test_real_labels_are_told_from_the_same_off_by_least(name):
     """A voxel and a half (15 mm along the chest's slices), 5 %, a mirror image: refused, and the true ones excluded."""
-    patient = dict(real(DATA))[name]
-    image, source = edge_image(patient.hu, patient.T), source_of(patient, meshes_of(patient))
+    patient, image, source = seen(name)
     assert assess(image, source).open == ()
     least = np.maximum(6.0, 1.5 * source.voxel_mm)
     mirror = np.eye(4)
@@ -56,32 +73,29 @@ def test_real_labels_are_told_from_the_same_off_by_least(name):
         assert np.sqrt(np.mean(np.sum((back[:, :3] - points) ** 2, axis=1))) < max(3.0, 0.5 * source.voxel_mm.max())
 
 
-@pytest.mark.skipif(not (DATA / "slicer_chest_ct4").is_dir(), reason="the real scans are not on this machine")
+@needs_scans
 def test_labels_that_were_resampled_in_another_pose_are_refused():
     """Five degrees on the CT's own grid: no shift finds them, 43 paths led through a gallbladder."""
-    patient = dict(real(DATA))["abdomen"]
-    source = source_of(patient, meshes_of(patient))
+    patient, image, source = seen("abdomen")
     turn = about(source.middles[0], exp_rotation([0.0, np.radians(5.0), 0.0]))
     off = {name: mesh.transformed(turn) for name, mesh in source.meshes.items()}
-    assert assess(edge_image(patient.hu, patient.T), source_of(patient, off)).refuses
+    assert assess(image, source_of(patient, off)).refuses
 
 
 def test_structures_that_agree_on_another_place_are_named():
     """Two of eight organs 24 mm off, the others right: they are named, and lie better at one and the same place."""
-    patient = PHANTOMS["trunk"]
-    meshes = meshes_of(patient)
-    off = {name: mesh.transformed(moved(0.0, 0.0, 24.0)) if name in "12" else mesh for name, mesh in meshes.items()}
-    image = edge_image(patient.hu, patient.T)
+    patient, image, source = seen("trunk")
+    down = moved(0.0, 0.0, 24.0)
+    off = {name: mesh.transformed(down) if name in "12" else mesh for name, mesh in source.meshes.items()}
     found = assess(image, source_of(patient, off))
     assert found.agreeing == ("1", "2") or found.refuses
-    assert assess(image, source_of(patient, meshes)).agreeing == ()
+    assert assess(image, source).agreeing == ()
 
 
 def test_one_structure_that_is_off_is_named():
     """Each of eight by itself 15 mm off to the side: it lies better elsewhere, or its outline is not confirmed."""
-    patient = PHANTOMS["trunk"]
-    image, meshes = edge_image(patient.hu, patient.T), meshes_of(patient)
-    true = assess(image, source_of(patient, meshes))
+    patient, image, source = seen("trunk")
+    meshes, true = source.meshes, assess(image, source)
     assert true.odd == true.unseen == ()
     assert len(true.unconfirmed) <= 3
     for name in ("2", "5", "6"):
@@ -125,10 +139,9 @@ def test_what_edges_cannot_tell_is_said():
 
 
 def test_surfaces_beside_the_image_are_not_said_to_fit():
-    patient = PHANTOMS["trunk"]
-    far = {n: mesh.transformed(moved(2000.0)) for n, mesh in meshes_of(patient).items()}
-    found = assess(edge_image(patient.hu, patient.T), source_of(patient, far))
-    assert "shift" in found.open
+    patient, image, source = seen("trunk")
+    far = {n: mesh.transformed(moved(2000.0)) for n, mesh in source.meshes.items()}
+    assert "shift" in assess(image, source_of(patient, far)).open
 
 
 def test_a_case_with_labels_beside_its_ct_is_refused_with_the_shift(tmp_path):

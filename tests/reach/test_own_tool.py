@@ -71,7 +71,7 @@ def answers():
         "none": NEEDLE,
         "rod": replace(THIN, body=body(rod(15.0, -5.0, 60.0))),
         "side": replace(NEEDLE, body=body(camera())),
-        "large": replace(NEEDLE, body=body(rod(200.0, 2.0, 30.0))),
+        "large": replace(NEEDLE, body=body(rod(200.0, 2.0, 30.0, sections=32))),
     }
     room = ([Box("table", np.eye(4) + shift(330, 0, -120), (600, 500, 60))], ball(TARGET))
     return {

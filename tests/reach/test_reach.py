@@ -1,11 +1,14 @@
 """Which directions the arm reaches: the windows and shares of the specification, laws of a drive, and known scenes."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 import trimesh
+from case_world import write_case
 from chen2019_reach import SHARES, WINDOWS, cap, runs
+from refusals import refused
 
 from puncture_twin.planning.arm.insertion import flange_poses, needle_lines, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse
@@ -18,8 +21,10 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.reach.reach import assess_reach_all
+from puncture_twin.planning.reach.reach import assess_reach_all, missing_reach_mm
 from puncture_twin.planning.reach.survey import MAX_SWEEP_MM, ReachRequest, every_branch, fill_branch_path, sampled
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import main
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -331,3 +336,63 @@ def test_how_far_a_path_may_have_moved_is_the_sum_of_its_bounds():
     assert not moved[0].any() and not moved[:, 0].any() and not rotated[0].any()
     assert np.array_equal(moved[1:, 1:], np.cumsum(swept.bounds_mm(path), axis=0))
     assert np.array_equal(rotated[1:], np.cumsum(np.abs(np.diff(path, axis=0)), axis=0))
+
+
+def test_reach_is_missing_exactly_where_no_solution_exists():
+    """0 mm missing and a solution go together; a straight arm asked to be 12.5 mm longer misses 12.5 mm."""
+    model = ur_model("ur3")
+    rng = np.random.default_rng(5)
+    poses = flange_pose(model, rng.uniform(-np.pi, np.pi, (500, 6)))
+    poses[:, :3, 3] *= rng.uniform(0.2, 1.6, (500, 1))
+    missing = missing_reach_mm(model, poses)
+    exists = ~np.isnan(inverse(model, poses)[..., 0]).all(axis=1)
+    assert np.array_equal(missing == 0.0, exists)
+    assert 100 < exists.sum() < 450
+    straight_up = flange_pose(model, np.array([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0]))
+    straight_up[2, 3] += 12.5
+    assert missing_reach_mm(model, straight_up)[0] == pytest.approx(12.5, abs=1e-6)
+
+
+@pytest.mark.parametrize(("shaft", "warned"), [(80.0, True), (95.0, False)])
+def test_a_needle_shorter_than_the_shortest_way_is_a_warning(tmp_path, shaft, warned):
+    """The skin is 90 mm away in every direction: a shaft of 80 mm reaches it nowhere."""
+    path = write_case(tmp_path, ("shaft_mm = 150.0", f"shaft_mm = {shaft}"))
+    found = [warning for warning in prepare(path, arm=False).anatomy.warnings if "every path is too long" in warning]
+    assert len(found) == warned
+    assert all("the needle's longest path is 80 mm, and the skin is 8" in warning for warning in found)
+
+
+def test_a_standoff_too_short_for_the_way_is_the_same(tmp_path):
+    """With a fixed standoff the tip must still wait outside of the skin."""
+    path = write_case(tmp_path, ("diameter_mm = 1.2", "diameter_mm = 1.2\nstandoff_mm = 90.0"))
+    assert any("longest path is 80 mm" in warning for warning in prepare(path, arm=False).anatomy.warnings)
+
+
+def test_a_needle_too_short_for_most_directions_is_said_after_the_search(tmp_path, capfd):
+    off = ("position_mm = [0.0, 0.0, 0.0]", "position_mm = [0.0, 15.0, 0.0]")
+    path = write_case(tmp_path, off, ("shaft_mm = 150.0", "shaft_mm = 80.0"), ("[0, 10]", "[0, 180]"))
+    command = ["search", str(path), "--no-arm", "--no-pictures", "--out", str(tmp_path / "out")]
+    main(command)
+    said = capfd.readouterr().out
+    assert "the needle is too short for " in said
+    main([*command, "--json"])
+    found = json.loads(capfd.readouterr().out)
+    assert found["counts"]["too_long"] > found["directions"] / 2
+    text = f"the needle is too short for {found['counts']['too_long']} of {found['directions']} directions"
+    assert any(text in warning for warning in found["warnings"])
+
+
+def test_check_says_how_deep_the_target_lies_in_its_structure(tmp_path, capfd):
+    """A ball of 20 mm about a target 15 mm from its middle: 5 mm below the surface, as its triangles have it."""
+    path = write_case(tmp_path, ("position_mm = [0.0, 0.0, 0.0]", "position_mm = [0.0, 15.0, 0.0]"))
+    main(["check", str(path), "--theta", "0", "--beta", "0", "--no-arm", "--json"])
+    assert json.loads(capfd.readouterr().out)["target_depth_mm"] == pytest.approx(5, abs=0.5)
+    main(["check", str(path), "--theta", "0", "--beta", "0", "--no-arm"])
+    assert "mm below the surface of organ" in capfd.readouterr().out
+
+
+def test_a_target_outside_says_by_how_much(tmp_path):
+    """Ten mm beyond a ball of 20 mm."""
+    path = write_case(tmp_path, ("position_mm = [0.0, 0.0, 0.0]", "position_mm = [0.0, 30.0, 0.0]"))
+    with refused("target_misplaced", "organ"):
+        prepare(path, arm=False)

@@ -6,11 +6,17 @@ from hypothesis import given, settings, strategies as st
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.geometry.rigid import apply
+from benchmarks.one_insertion import T, held, markers_of
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import singularity
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.geometry.rigid import apply, frame_about, pose
+from puncture_twin.planning.registration.fit_uncertainty import touching_configuration
 from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residuals import conditioning, leverage
+from puncture_twin.planning.uncertainty.hit import hit_in_ball, radius_for_chance
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])
@@ -99,3 +105,67 @@ def test_noise_does_not_look_mirrored():
     for _ in range(60):
         flat = MARKERS * [1, 1, 0.01]
         register(pairs(flat, flat + rng.normal(0, 1.5, flat.shape)), method="rigid", target_ct=TARGET)
+
+
+UR3 = ur_model("ur3")
+NEEDLE_MM = 200.0
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def points(count, seed):
+    rng = np.random.default_rng(seed)
+    side, away = rng.uniform(-1.0, 1.0, count), rng.uniform(200.0, 380.0, count)
+    return np.column_stack([away * np.cos(side), away * np.sin(side), rng.uniform(-50.0, 100.0, count)])
+
+
+def test_rounding_does_not_choose_between_mirrored_branches():
+    """A point moved by less than any machine's rounding is touched in the same configuration."""
+    rng = np.random.default_rng(1)
+    for point in points(40, seed=0):
+        q = touching_configuration(UR3, NEEDLE_MM, point, DOWN)
+        for moved in point + rng.normal(scale=1e-12, size=(10, 3)):
+            assert np.allclose(touching_configuration(UR3, NEEDLE_MM, moved, DOWN), q, atol=1e-9)
+
+
+def test_no_other_configuration_of_the_least_tilt_is_farther_from_singular():
+    """Against every branch of the poses that are tried; equals are there, of which the first is taken."""
+    equals = 0
+    for point in points(20, seed=2):
+        q = touching_configuration(UR3, NEEDLE_MM, point, DOWN)
+        every = inverse(UR3, pose(frame_about(DOWN), point - NEEDLE_MM * DOWN))[0]
+        every = every[UR3.within_limits(every)]
+        if not len(every) or singularity(UR3, every).least().max() < 0.05:
+            continue
+        least = singularity(UR3, every).least()
+        assert singularity(UR3, q).least() >= least.max() - 1e-9
+        equals += np.sum(least > least.max() - 1e-9) > 1
+    assert equals > 5
+
+
+@pytest.mark.parametrize("markers", [3, 4, 6, 8])
+def test_it_holds_what_it_says_whether_the_noise_is_stated_or_found(markers):
+    """5,000 draws of markers and target; the rms, which has no reading of the target, holds a sixth of them at most."""
+    found = held(markers, 5000, np.random.default_rng(markers))
+    assert found.stated == pytest.approx(0.95, abs=0.012)
+    assert found.found == pytest.approx(0.95, abs=0.012)
+    assert found.rms < 0.2
+
+
+@pytest.mark.parametrize("freedom", [None, 3, 12])
+def test_the_radius_is_the_chance_the_other_way_round(freedom):
+    cov = np.diag([4.0, 0.3, 0.01])
+    for chance in (0.5, 0.95):
+        assert hit_in_ball(cov[None], radius_for_chance(cov, chance, freedom), freedom)[0] == pytest.approx(
+            chance, abs=1e-3
+        )
+    assert radius_for_chance(np.zeros((3, 3)), 0.95, freedom) == 0.0
+
+
+def test_without_declared_errors_it_is_fitzpatricks_formula():
+    """The trace of the covariance, at the markers' middle and far away."""
+    points = markers_of(5)
+    pairs = MarkerPairs(tuple("ABCDE"), points, apply(T, points) + 0.2 * np.random.default_rng(2).normal(size=(5, 3)))
+    found = register(pairs, method="rigid", target_ct=np.zeros(3), fle_mm=1.0)
+    places = np.array([[0.0, 0.0, 40.0], [200.0, 100.0, -300.0]])
+    np.testing.assert_allclose(found.expected_tre_mm(places), leverage(points, places), rtol=0.01)
+    assert found.freedom is None

@@ -1,21 +1,27 @@
 """The batch search on the embedded cases: rows, ranking, the table, the closest miss."""
 
+import base64
+import io
 import json
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings, strategies as st
+from PIL import Image
 from refusals import refused
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.base.reasons import SAFE, Reason
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.case.tables import RankingSection
 from puncture_twin.planning.clearance.fcl_engine import CrossCheckError
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.ranking import pareto_front, rank
 from puncture_twin.planning.search.search import inside_length
@@ -143,3 +149,32 @@ def test_clearances_of_coarse_voxels_are_printed_without_hundredths_and_json_kee
     line = next(line for line in coarse.text().splitlines() if line.split()[:1] == ["bolt_h"])
     assert line.split()[2] == shown
     assert coarse.summary()["clearance_mm"] == found.summary()["clearance_mm"]
+
+
+class Grid(SimpleNamespace):
+    """With a length."""
+
+    def __len__(self):
+        return len(self.theta)
+
+
+def grid(step_deg):
+    theta, beta = np.meshgrid(np.arange(0, 60.01, step_deg), np.arange(0, 360, step_deg), indexing="ij")
+    n = theta.size
+    return Grid(
+        theta=np.radians(theta.ravel()), beta=np.radians(beta.ravel()), safe=np.ones(n, bool), safe_text="safe",
+        verdict=SimpleNamespace(reason=np.full(n, "", object)), ranked=np.empty(0, int), arm_note="checked",
+        counts=lambda: {"safe": n},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("step_deg", [1.0, 2.0, 5.0, 12.0])
+def test_a_safe_cap_is_one_whole_disc(step_deg):
+    shown = Candidates.plot_map(grid(step_deg))._repr_html_()
+    data = base64.b64decode(re.search(r'base64,([^"]+)"', shown)[1])
+    picture = np.asarray(Image.open(io.BytesIO(data))).astype(int)
+    inside = np.hypot(*np.meshgrid(*2 * [(np.arange(640) - 319.5) / 320])) < 1
+    lined = np.round(np.array(SAFE) * 0.55)
+    assert ((picture == SAFE) | (picture == lined)).all(axis=2)[inside].all()
+    assert (picture == SAFE).all(axis=2)[inside].mean() > 0.95
+    assert "no skin entry" not in shown

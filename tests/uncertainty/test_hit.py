@@ -2,15 +2,24 @@
 
 import numpy as np
 import pytest
-from scipy.special import chdtr
+import trimesh
+from scipy.special import chdtr, ndtr
 
+from puncture_twin.planning.clearance.engine import normals_of
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.search.candidate_chances import joint_touch_chance
 from puncture_twin.planning.uncertainty.hit import (
     chance_within,
     hit_in_ball,
     hit_in_mesh,
     mean_over_faces,
+    proximity,
     rays_to_ball,
     target_rays,
+    touch_chance,
 )
 
 DRAWS = np.random.default_rng(3).normal(size=(1_000_000, 3))
@@ -113,3 +122,134 @@ def test_no_error_hits_for_certain_and_outside_never(ball):
             0
         ] == pytest.approx(chance)
     assert hit_in_ball(np.zeros((1, 3, 3)), 0.5)[0] == pytest.approx(1.0)
+
+
+LENGTH, RADIUS = 150.0, 0.6
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def scene(*meshes):
+    return [TriangleMesh(mesh.vertices, mesh.faces) for mesh in meshes]
+
+
+def slab(x):
+    box = trimesh.creation.box(extents=[40.0, 4000.0, 4000.0])
+    box.apply_translation([x + 20.0, 0, 0])
+    return box
+
+
+def ball(radius, at):
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    mesh.apply_translation(at)
+    return mesh
+
+
+def near(meshes, cov, surface=0.0):
+    engine = FastEngine(meshes)
+    axes = engine.measure(np.zeros(3), UP[None], LENGTH)
+    normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)
+    return proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
+
+
+def drawn(meshes, cov, count, threshold, seed=0):
+    rng, engine = np.random.default_rng(seed), FastEngine(meshes)
+    errors = rng.multivariate_normal(np.zeros(6), cov, count, method="eigh")
+    met = np.empty((count, len(meshes)), bool)
+    for row, error in enumerate(errors):
+        outward = exp_rotation(error[3:]) @ UP
+        met[row] = engine.measure(error[:3], outward[None], LENGTH).distance[0] < threshold
+    return met.mean(axis=0), met.any(axis=1).mean()
+
+
+def test_closed_forms_of_a_half_space_and_a_ball():
+    cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    found = touch_chance(near(scene(slab(3.0)), cov), RADIUS)[0, 0]
+    assert found == pytest.approx(ndtr(-(3.0 - RADIUS)), rel=1e-9)
+    wider = touch_chance(near(scene(slab(3.0)), cov, surface=2.0), RADIUS)[0, 0]
+    assert wider == pytest.approx(ndtr(-(3.0 - RADIUS) / np.sqrt(5.0)), rel=1e-9)
+    s, phi = 0.4, 0.01
+    cov = np.diag([s**2, 9.0, 9.0, phi**2, phi**2, 0.0])
+    found = near(scene(ball(5.0, [8.0, 0.0, 100.0])), cov)
+    assert found.deviation[0, 0] == pytest.approx(np.hypot(s, 100.0 * phi), rel=1e-3)
+    assert found.distance[0, 0] == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize("distance", [1.5, 3.0])
+def test_a_round_organ_is_near_what_draws_say(distance):
+    cov = np.diag([1.0, 1.0, 0.5, 0.005**2, 0.005**2, 0.0])
+    meshes = scene(ball(12.0, [12.0 + distance, 0.0, 60.0]))
+    found = touch_chance(near(meshes, cov), RADIUS)[0, 0]
+    realised = drawn(meshes, cov, 4000, RADIUS)[0][0]
+    assert -0.015 < found - realised < 0.03
+
+
+def test_any_is_below_the_sum_and_near_the_draws():
+    cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    left = slab(2.0)
+    left.apply_transform(np.diag([-1.0, 1, 1, 1]))
+    left.invert()
+    both = near(scene(slab(2.0), left), cov)
+    twice = near(scene(slab(2.0), slab(2.0)), cov)
+    one = ndtr(-(2.0 - RADIUS))
+    assert joint_touch_chance(both, cov[None], RADIUS)[0] == pytest.approx(2 * one, abs=0.02)
+    assert joint_touch_chance(twice, cov[None], RADIUS)[0] == pytest.approx(one, abs=0.02)
+    assert touch_chance(twice, RADIUS).sum() == pytest.approx(2 * one)
+    cov, surface = np.diag([0.25, 0.25, 0.25, 0.0, 0.0, 0.0]), 1.0
+    twice = near(scene(slab(2.0), slab(2.0)), cov, surface=surface)
+    rng = np.random.default_rng(8)
+    shift, off = rng.normal(0.0, 0.5, 200_000), rng.normal(0.0, surface, (200_000, 2))
+    truth = np.mean((shift[:, None] + off > 2.0 - RADIUS).any(axis=1))
+    assert joint_touch_chance(twice, cov[None], RADIUS, surface_mm=surface)[0] == pytest.approx(truth, abs=0.02)
+
+
+def test_no_error_touches_for_certain_or_never_and_an_estimated_size_more_often():
+    nothing = np.zeros((6, 6))
+    clear = near(scene(slab(3.0), ball(5.0, [0.0, 0.0, 80.0])), nothing)
+    assert touch_chance(clear, RADIUS)[0, 0] == 0.0
+    assert touch_chance(clear, 4.0)[0, 0] == 1.0
+    assert np.isnan(touch_chance(clear, RADIUS)[0, 1])
+    cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    found = near(scene(slab(4.0)), cov)
+    assert touch_chance(found, RADIUS, 3)[0, 0] > 10 * touch_chance(found, RADIUS)[0, 0]
+
+
+def test_both_engines_say_from_where_an_axis_is_nearest(rng):
+    meshes = []
+    for _ in range(4):
+        mesh = trimesh.creation.icosphere(subdivisions=2, radius=rng.uniform(5, 30))
+        mesh.vertices = mesh.vertices * rng.normal(1, 0.1, (len(mesh.vertices), 1)) + rng.uniform(-80, 80, 3)
+        meshes += scene(mesh)
+    outward = rng.normal(size=(200, 3))
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    fast, fcl = (kind(meshes) for kind in (FastEngine, FclEngine))
+    axes = fast.measure(np.zeros(3), outward, LENGTH)
+    normals = normals_of(fast.triangles, np.zeros(3), outward, axes)
+    np.testing.assert_allclose(
+        normals, normals_of(fcl.triangles, np.zeros(3), outward, fcl.measure(np.zeros(3), outward, LENGTH)), atol=1e-9
+    )
+    assert np.isnan(normals).any(axis=2).sum() == (axes.distance == 0).sum() > 0
+    for column, mesh in enumerate(meshes):
+        for row in np.flatnonzero(axes.distance[:, column] > 0)[::4]:
+            point = outward[row] * axes.depth[row, column]
+            away = point - trimesh.triangles.closest_point(mesh.vertices[mesh.faces], [point] * len(mesh.faces))
+            away = away[np.linalg.norm(away, axis=1).argmin()]
+            np.testing.assert_allclose(normals[row, column] * axes.distance[row, column], away, atol=1e-9)
+    engine = FastEngine(scene(ball(10.0, [30.0, 0.0, 40.0]), slab(25.0)))
+    outward = rng.normal(size=(60, 3))
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    axes, rows = engine.measure(np.zeros(3), outward, LENGTH), rng.permutation(60)[:17]
+    every = normals_of(engine.triangles, np.zeros(3), outward, axes)
+    np.testing.assert_array_equal(normals_of(engine.triangles, np.zeros(3), outward[rows], axes.at(rows)), every[rows])
+
+
+@pytest.mark.parametrize("kind", [FastEngine, FclEngine])
+def test_of_two_points_as_near_either_is_named(kind):
+    """Midway between two faces of one structure the normal is that of one of them."""
+    left, right = slab(2.0), slab(2.0)
+    left.apply_transform(np.diag([-1.0, 1, 1, 1]))
+    left.invert()
+    engine = kind(scene(left + right))
+    axes = engine.measure(np.zeros(3), UP[None], LENGTH)
+    normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)[0, 0]
+    assert axes.distance[0, 0] == pytest.approx(2.0)
+    np.testing.assert_allclose(np.abs(normal), [1.0, 0.0, 0.0], atol=1e-12)

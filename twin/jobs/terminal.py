@@ -28,7 +28,7 @@ from puncture_twin.planning.base.files import atomic
 UNNAMED_CASES = frozenset({"case.toml", "servo.toml", "selfcal.toml", "plan.json"})
 """Files that are named by their folder."""
 AGAIN_S = 0.02  # how soon an interruption that was swallowed, or put off, comes again
-UNBREAKABLE = frozenset({"importlib", "llvmlite"})  # packages whose functions an interruption does not leave
+UNBREAKABLE = frozenset({"importlib", "llvmlite"})  # packages that an interruption does not leave, nor what they call
 LOOKS_EVERY = 20_000
 """New objects between Python's searches for circles of them: at its own 700 a first command, for which numba makes
 millions, spends a fifth of its time in looking."""

@@ -161,7 +161,7 @@ def draw_touch_truth(
 def draw_pivot_truth(
     T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the errors of an arm that sets its tip onto one place (3,), mm, n times; the patient is at T_base_ct (4, 4)."""
+    """Draw the errors of an arm that sets its tip onto one place (3,), mm, n times; patient at T_base_ct (4, 4)."""
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     aim_base = place_base + rng.normal(0.0, errors.touch_mm, (len(names), 3))

@@ -134,7 +134,7 @@ JOINTS = (
 def calibrate_dynamics(context: CaseContext, recording: Path) -> Dynamics:
     """Identify the dynamics of a case's arm, and say what their error costs at the tip.
 
-    Raises InputError: Base or reach of the arm is not known, or a recording cannot be used.
+    Raises InputError: The arm's base is not stated, no insertion is reached, or the recording cannot be used.
     """
     case, T_base_ct = context.case, context.require_arm().T_base_ct
     found = identify(case.robot.model, read_torques(recording), gravity(case, T_base_ct), where=recording)
@@ -214,7 +214,8 @@ def recorded_or_given(context: CaseContext, recording: Path | None, record: Path
 def record_dynamics(context: CaseContext, path: Path, seed: int) -> Path:
     """Record torques of the simulated arm in an exciting motion, twice over, into a new CSV; the seed draws both.
 
-    Raises InputError: No base of the arm, or no such file. NoAnswerError: No exciting motion is free of contact.
+    Raises InputError: The arm's base is not stated, or the file cannot be written. NoAnswerError: No exciting motion is
+    free of contact.
     """
     case, reach = context.case, context.require_arm()
     model, down, checker = slowed(case.robot.model, case.robot.speeds), gravity(case, reach.T_base_ct), reach.checker

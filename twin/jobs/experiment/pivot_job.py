@@ -172,7 +172,8 @@ def parse_place(text: str | None) -> Floats | None:
 def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats | None, seed: int) -> PivotTourRun:
     """Plan a pivot calibration about a place (3,), mm, or one that is found, execute it in the twin, write its result.
 
-    Raises InputError: No declared errors, no arm, or such a number of poses. NoAnswerError: Too few can be touched.
+    Raises InputError: No declared errors, no arm, or too few or many poses. NoAnswerError: No place can be touched in
+    so many, or too few were touched.
     """
     case = context.case
     if not LEAST_POSES <= poses <= MOST_POSES:

@@ -191,6 +191,7 @@ def _lesion(context: CaseContext, scene: scenes.CaseScene, image: CtImage, volum
 
 
 def _rehearsed(path: Path | None) -> tuple[tuple[scenes.TrueRod, Floats] | None, tuple[Input, ...]]:
+    """The needle at the end of a rehearsal, and the true target, in the case's frame."""
     if path is None:
         return None, ()
     allowed = "a rehearsal.json of this version"

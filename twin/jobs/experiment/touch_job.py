@@ -260,6 +260,7 @@ def touch_text(run: TouchRun) -> str:
 
 
 def _per_touch(touched: Touched) -> float | None:
+    """Seconds for each that was read."""
     return touched.seconds / len(touched.readings) if touched.readings else None
 
 

@@ -98,7 +98,7 @@ def read_message(header: Header, body: bytes) -> Message:
 
 
 def read_place(message: Message) -> Floats:
-    """The point (3,) of a POINT with one point, or the origin of a TRANSFORM; an `InputError` if that is not finite."""
+    """The point (3,) of a POINT, or the origin of a TRANSFORM; an `InputError` if not one point, or not finite."""
     if message.kind == "TRANSFORM":
         return _finite(_matrix(message.content, message)[:, 3], message)
     if len(message.content) != POINT.size:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,10 +31,12 @@ from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE
-from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.truth import read_points
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
+
+if TYPE_CHECKING:  # with the planner of motions, which reading an arm does not need
+    from puncture_twin.twin.devices import Arm
 
 RTDE_PORT = 30004  # on which a controller tells its state; the only port that is used
 VARIABLES = ("timestamp", "actual_q")  # what the controller is queried to tell

@@ -40,8 +40,8 @@ TABLE_2_PRINTED = ((1.06, 1.76), (1.47, 2.41), (1.00, 1.67))
 
 COLUMNS = ("stereo", "mapping", "before", "after")
 ROUNDING_MM = 0.005  # the paper prints two decimals
-MOST_OVER_MAPPING = 1.1  # after the servo, over the mapping's error, its floor, beyond chance. The paper: 0.94
-MOST_NOT_CONFIRMED = 0.1  # of the targets at which the servo may end so; the paper reports none of sixteen
+MOST_OVER_MAPPING = 1.1  # of the error after the servo over the mapping's, its floor, beyond chance. The paper: 0.94
+MOST_NOT_CONFIRMED = 0.1  # fraction of targets that the servo may not confirm; the paper reports none of sixteen
 CHANCE = 2.0  # standard errors that a condition allows for
 CASE = "liu2007.toml"
 DEFAULT_SEEDS = 8

@@ -119,7 +119,7 @@ def _report(
 def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Floats | None) -> dict[str, Any]:
     """Within which of its true place a target (3,), mm, is sent to in 95 of 100 registrations, its own reading in it.
 
-    That is as declared; of None it is read as a marker is, in both lists.
+    `read_cov_ct`, (3, 3), mm^2, is of that reading, as declared; None where it is read as a marker is, in both lists.
     """
     cov, R = registration.tre_covariance(target_ct), registration.T_base_ct[:3, :3]
     read, how = registration.fle_mm**2 / 3.0 * np.eye(3), "like a marker, in both lists"

@@ -59,7 +59,8 @@ CONFIRMATION = "a confirm.json of this version"
 MAX_CONFIRMATION_BYTES = 5_000_000
 CONFIRMED = ("lateral_mm", "depth_mm", "angle_deg", "inserted_mm", "sagitta_mm")
 STATED = ("verdict", "structure", "in_predicted_region")
-AIMED = ("by_mm", "turn_deg", "p_hit", "lateral_mm")  # words and numbers of a confirmation, and of its next aim
+AIMED = ("by_mm", "turn_deg", "p_hit", "lateral_mm")
+"""Numbers and words of a confirmation, and numbers of what it says is to be done next."""
 TABLE = "candidates.parquet"
 CANDIDATES_CSV = "candidates-csv"
 CANDIDATE_FORMATS = (CANDIDATES_CSV, "candidates-json")

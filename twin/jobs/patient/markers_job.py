@@ -213,12 +213,12 @@ class _Sheet(NamedTuple):
 
 def _written(run: Run, sheet: _Sheet, out: Path, csv: str, inputs: tuple[Input, ...], watcher: Watcher) -> Run:
     """A run with its files; Slicer knows no space of a case's own, and gets no list of it."""
+    from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
+
     names, points, space = sheet.points.names, sheet.points.points, sheet.points.space or Space.LPS
     markups: list[str] = [] if space is Space.LOCAL else [csv.replace(".csv", MARKUPS)]
     files = (csv, *markups, PICTURE, REPORT)
     with writing(out, "markers", inputs=inputs, names=files, note=watcher.note) as draft:
-        from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
-
         write_points(draft.folder / csv, replace(sheet.points, points=to_lps(points, space)))
         for name in markups:
             (draft.folder / name).write_text(markups_text("Fiducial", "markers", names, points), encoding="utf-8")

@@ -195,6 +195,7 @@ def draw_confirmed(done: Any, path: Path) -> Path:
 
 
 def _draw_scan(axes: Axes, done: Any, plane: Plane) -> None:
+    """The scan in a plane, with the outlines of the planning CT's structures carried to it."""
     index = apply(np.linalg.inv(done.volume.T_ct_index) @ done.tie.T_scan_ct, plane.points_ct(SLICE_PIXELS)).T
     shown = ndimage.map_coordinates(done.volume.values, index, np.float64, order=1, cval=-1024.0)
     (x, y), half, (low, high) = plane.centre, plane.half_mm, WINDOW_HU

@@ -25,7 +25,7 @@ from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergenc
 from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.rehearsal import stereo_session
 from puncture_twin.twin.report import present
-from puncture_twin.twin.report.present import Block, Card, Field, Section, Table, Warn, grid, number
+from puncture_twin.twin.report.present import Block, Card, Field, Section, Table, Warn, grid, number, percent
 
 PHASES = {"open_loop": "by mapping and robot alone", "servoed": "after the servo"}
 NO_TOUCH = "not computed: the case has no structures"  # of ``p_touch``: which is something else than 0
@@ -169,7 +169,7 @@ STATISTICS = (
     Field("after over mapping (its floor is 1)", "after_over_mapping", 3),
     Field("servo-only, mean and maximum", lambda ours: _mean_and_most(ours, "servo_only")),
     Field("corrections, median", "median_steps", 1),
-    Field("not confirmed", lambda ours: present.percent(ours["not_confirmed"])),
+    Field("not confirmed", lambda ours: percent(ours["not_confirmed"])),
 )  # fmt: skip
 CALIBRATION = (
     Field("residual of each camera (rms)", lambda one: " and ".join(
@@ -243,9 +243,7 @@ def _cards(facts: Facts) -> list[Card]:
         Card("before the servo", number(ours["before_mean"], 2, "mm"), "mean, true ball to true target"),
         Card("after the servo", number(ours["after_mean"], 2, "mm"), f"{ratio} times the mapping's"),
         Card("servo-only", number(ours["servo_only_mean"], 3, "mm"), f"mean; at most {most} mm"),
-        Card(
-            "not confirmed", present.percent(ours["not_confirmed"]), f"within {tolerance:g} mm; median {steps:g} steps"
-        ),
+        Card("not confirmed", percent(ours["not_confirmed"]), f"within {tolerance:g} mm; median {steps:g} steps"),
     ]
 
 

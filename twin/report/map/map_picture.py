@@ -41,9 +41,16 @@ LETTERS, MOST_LINES = 46, 19  # of the key of reasons: letters a line, lines at 
 PALE: Rgb = (205, 235, 220)  # below the legend's hatching
 
 
-def draw_map(candidates: Candidates, case: Any, path: Path, pick: Pick | None = None, **known: Any) -> None:
+def draw_map(
+    candidates: Candidates,
+    case: Any,
+    path: Path,
+    pick: Pick | None = None,
+    raster: MapRaster | None = None,
+    scan: Any = None,
+) -> None:
     """Write the map of a search; arguments as of `map_figure`."""
-    write_png(map_figure(candidates, case, pick, **known), path)
+    write_png(map_figure(candidates, case, pick, raster, scan), path)
 
 
 def map_figure(

@@ -51,7 +51,7 @@ class ViewCamera:
 
 
 def camera_around(points_ct: Floats, toward: Floats, up: Floats, *, fov: float, width: int, height: int) -> ViewCamera:
-    """A camera that looks along `toward`, (3,), with all points (n, 3) in view; `fov` is the vertical opening, rad."""
+    """A camera along `toward`, (3,), with `up`, (3,), and all points (n, 3) in view; `fov`: vertical opening, rad."""
     points = np.asarray(points_ct, dtype=float)
     toward = np.asarray(toward, dtype=float) / np.linalg.norm(toward)
     centre = box_of(points).sum(axis=0) / 2

@@ -170,6 +170,7 @@ def _drawn_band(solid: View, glass: View, rows: slice) -> _Band:
 def _finished(
     solid: Look, glass: Look, grid: tuple[float, int, int], corner: tuple[int, int], behind: Drawn, shells: Ints32
 ) -> Pixels:
+    """The pixels (h, w, 3) of a part of a picture, from the triangles that its samples show."""
     held = np.zeros((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)  # what is not there is blended at 0
     high, wide = behind.triangle.shape[1:]
     pixels = np.empty((high // SAMPLES, wide // SAMPLES, 3), dtype=np.uint8)

@@ -197,7 +197,10 @@ def needle_bodies(
 
 
 class ArmPicture:
-    """The arm's links ready to be drawn at any configuration, with a tool that its flange carries beside the needle."""
+    """The arm's links ready to be drawn at any configuration, with a tool that its flange carries beside the needle.
+
+    `T_base_ct`, (4, 4), mm, is where the patient is believed, or known, to be.
+    """
 
     def __init__(self, model: UrModel, T_base_ct: Floats, tool: ToolBody | None = None) -> None:
         self._model = model

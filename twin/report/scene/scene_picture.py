@@ -28,7 +28,7 @@ AXES_LENGTH, AXES_CORNER = 44, 110  # pixels: length of the body's axes, and how
 CORNER_GAIN = 0.1  # how much emptier the upper corner must be for the axes to stand there instead of below
 BODY_RADIUS_MM = 700.0  # the overview shows the patient within this distance of the target, and the whole arm
 CLOSE_RADIUS_MM = 38.0
-HIDDEN_NEARBY = ("room", "safe")  # in the close-up: a rib seen through green would look safe to hit
+HIDDEN_NEARBY = ("room", "safe")  # not in the close-up: a rib seen through green would look safe to hit
 NOTHING_RADIUS_MM = 90.0  # around the target, when there is no path to show
 MOST_ENTRIES = 26  # up to so many entries of the legend nothing is folded
 

@@ -193,6 +193,7 @@ def _line(axes: Axes, points: Floats, width: float, colour: Rgb, style: str = "-
 
 
 def _segments(axes: Axes, segments: Floats, width: float, colour: Rgb) -> None:
+    """Lines from point to point, each alone, shape (n, 2, 2), mm: one path, with gaps between."""
     if len(segments) == 0:
         return
     gaps = np.full((len(segments), 1, 2), np.nan)

@@ -13,8 +13,9 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map_view import body_directions
 
 LEFT, BACK, HEAD = (np.array(ANATOMICAL_LPS[name]) for name in ("left", "posterior", "head"))
-ALONG_LEFT = 0.95  # a needle within 18 degrees of this axis spans no plane with it: that rises to the front
-LEAST_HALF_MM, BESIDE_MM, PROBE_HALF_MM = 60.0, 35.0, 40.0  # half a side: at least, about a path, of the probe's eye
+ALONG_LEFT = 0.95  # a needle within 18 degrees of the left-right axis: its plane rises to the front instead
+LEAST_HALF_MM, BESIDE_MM, PROBE_HALF_MM = 60.0, 35.0, 40.0
+"""Half a picture's side at least, what it shows beyond target and entry, and half of the probe's-eye view."""
 OBLIQUE = 0.38  # a direction within 22 degrees of an axis is named by that axis alone
 LETTERS = {"patient's left": "L", "patient's right": "R", "back": "P", "front": "A", "head": "H", "feet": "F"}
 CAPSULE_POINTS, ELLIPSE_POINTS = 181, 121  # on each of a capsule's two sides; about an ellipse
@@ -152,11 +153,11 @@ def _cut(mesh: TriangleMesh, plane: Plane) -> Floats:
 
 
 def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane) -> Floats:
-    """The cut of all within a radius of a piece of the needle's axis, a closed line (2 k, 2), mm from the target.
+    """The cut of all within a radius of a piece of the needle's axis, a closed line (2 k, 2), mm.
 
     With a along the axis' shadow in the plane and b across it, the axis' nearest point to (a, b) is s = a sin(phi),
     kept within 0..length; phi is the angle between axis and normal, and b^2 = radius^2 - (a^2 - 2 a s sin(phi) + s^2).
-    The piece begins at the target and goes along the needle, unit, (3,).
+    The piece begins at the target and goes along the needle, unit, (3,); the line is mm right and up of the target.
     """
     shadow = np.array([outward_ct @ plane.right, outward_ct @ plane.up])
     sine, cosine = min(1.0, float(np.linalg.norm(shadow))), abs(float(outward_ct @ plane.normal))
