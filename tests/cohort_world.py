@@ -7,7 +7,7 @@ import time
 import uuid
 
 import pyarrow.parquet as pq
-from case_world import ORGAN, SKIN, case_text, structure, whole, write_balls
+from case_world import ORGAN, SKIN, case_text, changed, structure, whole, write_balls
 
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY
 from puncture_twin.planning.batch.cohort import CohortCase
@@ -19,22 +19,16 @@ from puncture_twin.run_twin import main
 SEARCH = "theta_deg = [0, 60]\nbeta_deg = [0, 270]\nstep_deg = 30.0"
 
 
-def tiny_text(margin=3.0, **keys):
+def tiny_text(search=SEARCH, **keys):
     """A case whose structures are the usual meshes; a dozen directions."""
-    return case_text(
-        SKIN, ORGAN, structure("rib", "avoid", margin_mm=margin), search=keys.pop("search", SEARCH), **keys
-    )
+    return case_text(SKIN, ORGAN, structure("rib", "avoid", margin_mm=3.0), search=search, **keys)
 
 
 def write_patient(folder, *changes, text=None):
     """A patient in a folder of its own, with (old, new) changes to the case; returns the case file."""
     folder.mkdir(parents=True)
     write_balls(folder)
-    said = tiny_text() if text is None else text
-    for old, new in changes:
-        assert old in said
-        said = said.replace(old, new, 1)
-    (folder / "case.toml").write_text(whole(said))
+    (folder / "case.toml").write_text(whole(changed(tiny_text() if text is None else text, *changes)))
     return folder / "case.toml"
 
 
@@ -93,7 +87,6 @@ def sleep_or_eat(context, found, folder):
 
 
 def fail(context, found, folder):
-    """A bug."""
     raise ZeroDivisionError("a bug")
 
 

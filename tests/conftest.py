@@ -1,6 +1,7 @@
 """What many tests share."""
 
 import gc
+import json
 import os
 from importlib.util import find_spec
 
@@ -60,8 +61,21 @@ def pytest_runtest_makereport(item, call):
 
 @pytest.fixture
 def rng():
-    """A seeded generator."""
     return np.random.default_rng(20191104)
+
+
+@pytest.fixture
+def run(capfd):
+    """A function: a command with --json; its exit code, and the one object on stdout, or None."""
+    from puncture_twin.run_twin import main
+
+    def answer(*arguments):
+        capfd.readouterr()
+        code = main([*map(str, arguments), "--json"])
+        out = capfd.readouterr().out
+        return code, json.loads(out) if out else None
+
+    return answer
 
 
 @pytest.fixture(scope="session")

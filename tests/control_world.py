@@ -69,10 +69,10 @@ class Bench(NamedTuple):
 
 
 @contextmanager
-def bench(down=DOWN, factors=None, T_world_base=None):
+def bench(down=DOWN, factors=None):
     """Open it; the true masses are the model's times some factors, one a link."""
     with physics_client(down) as client, rigid_model(UR3, TOOL, down) as model:
-        arm = load_arm(client, UR3, TOOL, T_world_base)
+        arm = load_arm(client, UR3, TOOL)
         for link in range(-1, -1 if factors is None else pybullet.getNumJoints(arm.body, physicsClientId=client)):
             mass, _, inertia = pybullet.getDynamicsInfo(arm.body, link, physicsClientId=client)[:3]
             scaled = {"mass": mass * factors[link], "localInertiaDiagonal": [one * factors[link] for one in inertia]}

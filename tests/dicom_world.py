@@ -89,7 +89,6 @@ def ct_slice(stored, T, k=0, number=None, **more):
 
 
 def series(values=None, T=None, **more):
-    """The slices of a series, in order."""
     values, T = phantom() if values is None else values, affine() if T is None else T
     return [ct_slice(values[:, :, k], T, k, **more) for k in range(values.shape[2])]
 
@@ -117,7 +116,6 @@ def enhanced(values=None, T=None):
 
 
 def item(**values):
-    """A data set in a sequence."""
     made = Dataset()
     for keyword, value in values.items():
         setattr(made, keyword, Sequence(value) if isinstance(value, list) and isinstance(value[0], Dataset) else value)
@@ -125,7 +123,6 @@ def item(**values):
 
 
 def write(data, path, syntax=None):
-    """One file."""
     if syntax is not None:
         data.file_meta.TransferSyntaxUID = UID(syntax)
     data.save_as(path, enforce_file_format=True)

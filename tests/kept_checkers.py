@@ -2,13 +2,9 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import Any, TypeVar
 
 from puncture_twin.planning.base.cache.array_cache import Cache, Memory, user_cache
-from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-
-Kind = TypeVar("Kind", bound=CellChecker)
 
 
 @cache
@@ -17,6 +13,6 @@ def enclosures() -> Cache:
     return replace(user_cache(), memory=Memory(10**9))
 
 
-def built(kind: type[Kind], *arguments: Any, **named: Any) -> Kind:
+def built(kind, *arguments, **named):
     """A checker of a kind, from its own arguments."""
     return kind(*arguments, **named, **({"cache": enclosures()} if kind is FastChecker else {}))

@@ -113,5 +113,4 @@ def said(command, counts: Counter):
 
 
 def generator(name):
-    """Seeded by the command's name."""
     return np.random.default_rng([ord(letter) for letter in name])

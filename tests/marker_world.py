@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks import markers as drawn
 from benchmarks.markers import Markers, body_of, scanned
-from puncture_twin.planning.registration.fiducials import Stated, find_fiducials, look_for_fiducials
+from puncture_twin.planning.registration.fiducials import Stated, look_for_fiducials
 from puncture_twin.twin.plant.scanner.image import Solid, ball
 
 
@@ -35,14 +35,11 @@ def scene(markers, rng, *, others=True):
     return points, [*(drawn.table() if others else []), drawn.body(), *(distractors(rng) if others else []), *on]
 
 
-def found_in(markers, settings, *, others=True, stated=None):
+def found_in(markers, settings, *, others=True):
     """True centres, and what is found in their scan."""
     rng = np.random.default_rng(settings.seed)
     true, solids = scene(markers, rng, others=others)
-    volume, skin = body_of(scanned(solids, settings, rng))
-    if stated is None:
-        return true, look_for_fiducials(volume, skin)
-    return true, find_fiducials(volume, skin, stated, where="test")
+    return true, look_for_fiducials(*body_of(scanned(solids, settings, rng)))
 
 
 def matched(true, fiducials):

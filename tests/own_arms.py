@@ -136,7 +136,6 @@ def placed(tag):
 
 
 def turned(joint, angle):
-    """A joint's rotation."""
     T = np.eye(4)
     if joint.get("type") != "fixed":
         T[:3, :3] = about(np.array([float(word) for word in joint.find("axis").get("xyz").split()]), angle)

@@ -36,7 +36,6 @@ SHOWN = """() => [...document.querySelectorAll("#slices-a .slice")].map((one) =>
 
 @contextmanager
 def chromium():
-    """A browser."""
     with sync_api.sync_playwright() as playwright:
         try:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE_MS)
@@ -90,7 +89,6 @@ def picture(address):
 
 
 def row_of(candidates, theta_deg, beta_deg):
-    """The row of two angles."""
     same = np.isclose(candidates.theta, np.radians(theta_deg)) & np.isclose(candidates.beta, np.radians(beta_deg))
     return int(np.flatnonzero(same)[0])
 

@@ -61,16 +61,14 @@ def make_case(*, space="LPS", frame=None, name="ball"):
     )
 
 
-def make_grid(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360)):
-    """The grid of `make_candidates`."""
+def make_directions(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360)):
     limits = [tuple(np.radians(pair)) for pair in (theta_deg, beta_deg)]
-    return grid(*limits, np.radians(step_deg), case.T_ct_entry[:3, :3]).grid
+    return grid(*limits, np.radians(step_deg), case.T_ct_entry[:3, :3])
 
 
-def make_candidates(case, *, step_deg=5.0, theta_deg=(0, 90), beta_deg=(0, 360), safe=True):
+def make_candidates(case, *, safe=True, **limits):
     """β 30-90: ``too_close`` (rib); θ from 70 on: ``too_long``; else safe, clearance growing with θ."""
-    limits = [tuple(np.radians(pair)) for pair in (theta_deg, beta_deg)]
-    ways = grid(*limits, np.radians(step_deg), case.T_ct_entry[:3, :3])
+    ways = make_directions(case, **limits)
     theta, beta = np.degrees(ways.theta), np.degrees(ways.beta)
     n = len(ways)
     reason = np.full(n, "", dtype="U20")

@@ -35,12 +35,10 @@ def write_image(path, voxels):
 
 
 def write_ct(path):
-    """The body's CT."""
     write_image(path, body_hu().astype(np.int16))
 
 
 def write_mask(path, voxels):
-    """One structure."""
     write_image(path, voxels.astype(np.uint8))
 
 

@@ -144,7 +144,6 @@ class Heard:
         self._process.stdin.flush()
 
     def end(self) -> None:
-        """End the process, and keep its report."""
         if self._process.poll() is None:
             said = json.loads(self._process.communicate("end\n", timeout=20)[0])
             self.received = [(kind, bytes.fromhex(content)) for kind, content in said["received"]]

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
-from case_world import points_file
+from case_world import ball as write_ball, case_text, points_file, structure
 from places import ROOT
 
 from puncture_twin.planning.arm.insertion import flange_poses
@@ -111,62 +110,32 @@ def _nearest(model, point, outward, tip, q_near):
     return q_near + turns[np.abs(turns).max(axis=1).argmin()]
 
 
-CASE = """schema = 2
-region = "phantom"
-name = "ball"
-space = "local"
-[target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[search]
-theta_deg = [20, 20]
-beta_deg = [0, 80]
-step_deg = 20.0
-{search}
-[errors]
-{errors}
-[robot]
-model = "ur3"
-{base}
-[[structure]]
-name = "skin"
-mesh = "skin.ply"
-unit = "mm"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.ply"
-unit = "mm"
-role = "target"
-[[structure]]
-name = "rib"
-mesh = "rib.ply"
-unit = "mm"
-role = "avoid"
-margin_mm = 2.0
-[end]
-structures = 3
-"""
 MARKERS = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
 MOUNT = "[robot.mount]\nposition_mm = [0.0, 380.0, -60.0]\nx_axis = [1.0, 0.0, 0.0]\nz_axis = [0.0, 0.0, 1.0]\n"
 TO_BASE = np.array([0.0, -380.0, 60.0])
 SIDES = np.array([[0.3, 0.2, 1], [-0.5, 0.3, 0.9], [0.1, -0.7, 0.8], [0.8, 0.1, 0.6], [-0.3, -0.5, 1], [0.2, 0.9, 0.5]])
 
 
+SEARCH = "theta_deg = [20, 20]\nbeta_deg = [0, 80]\nstep_deg = 20.0\n"
+BALLS = {"skin": (75.0, (0, 0, 0)), "organ": (6.0, (0, 0, 0)), "rib": (5.0, (20, 0, 40))}
+"""Radius and centre of each mesh, mm."""
+STRUCTURES = [
+    structure(name, role, {"mesh": f"{name}.ply", "unit": "mm"}, **keys)
+    for name, role, keys in (("skin", "skin", {}), ("organ", "target", {}), ("rib", "avoid", {"margin_mm": 2.0}))
+]
+
+
 def ball(folder, *, search="", errors="", base=MARKERS, noise=0.3, organ=None):
     """A round patient in front of a UR3, with six markers on its skin; returns the case's file."""
-    meshes = {"skin": (75.0, (0, 0, 0)), "organ": (6.0, (0, 0, 0)), "rib": (5.0, (20, 0, 40))}
-    for name, (radius, center) in meshes.items():
-        mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        mesh.apply_translation(center)
-        (organ if name == "organ" and organ is not None else mesh).export(folder / f"{name}.ply")
+    for name, shape in BALLS.items():
+        write_ball(folder / f"{name}.ply", *shape)
+    if organ is not None:
+        organ.export(folder / "organ.ply")
     points = 75.0 * SIDES / np.linalg.norm(SIDES, axis=1)[:, None]
     off = noise * np.random.default_rng(1).normal(size=points.shape)
     (folder / "markers_ct.csv").write_text(points_file(points))
     (folder / "touch.csv").write_text(points_file(points + TO_BASE + off))
-    (folder / "case.toml").write_text(CASE.format(search=search, errors=errors, base=base))
+    sections = f"[errors]\n{errors}\n", f'[robot]\nmodel = "ur3"\n{base}\n', *STRUCTURES
+    text = case_text(*sections, name="ball", region="phantom", space="local", search=SEARCH + search)
+    (folder / "case.toml").write_text(text)
     return folder / "case.toml"

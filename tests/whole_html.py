@@ -22,9 +22,7 @@ class Whole(HTMLParser):
         assert all(value.startswith("data:") for name, value in attrs if name == "src")
 
     def handle_startendtag(self, tag, attrs):
-        """An element without a content."""
         self.tags.append(tag)
 
     def handle_endtag(self, tag):
-        """The last one opened is closed first."""
         assert self.open.pop() == tag

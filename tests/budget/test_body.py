@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from math import comb
 
 import numpy as np
 import pytest
+from budget_world import chain as chain_of_case, drawn_trials
 from case_world import ORGAN, SKIN, ball, case_text, structure
-from places import ROOT
-from typer.testing import CliRunner
 
-from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within, mean_square_within
-from puncture_twin.planning.budget.chain import chain_of, other_gauges
+from puncture_twin.planning.budget.chain import other_gauges
 from puncture_twin.planning.budget.what_if import changes, source_costs
-from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.deflection import GAUGES, Shaft
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise
-from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.registration import reached_insertion
 from puncture_twin.planning.uncertainty.pose_error import Bend
-from puncture_twin.run_twin import app
-from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
-ABDOMEN = ROOT / "meshes" / "abdomen"
 ROOMS = 8_000
 
 
@@ -42,9 +32,7 @@ def breath(gate, scanned_at=0.0, exponent=2):
 
 @pytest.fixture(scope="module")
 def chain():
-    case = load_case(ABDOMEN)
-    placement = load_placement(case)
-    return chain_of(case, placement.registration, reached_insertion(case, placement.T_base_ct))
+    return chain_of_case("abdomen/case.toml")
 
 
 @pytest.mark.parametrize("exponent", [1, 2, 4, 6])
@@ -67,15 +55,8 @@ def drawn_positions(one, count, rng):
 def test_rooms_with_bevel_and_breath_err_as_predicted(chain, gate):
     """Whole chains, each needle bent to a side and inserted at a time that are drawn; also per axis of the base."""
     both = replace(chain, path=Path(), breathing=breath(gate, scanned_at=0.1))
-    noise = reading_noise(chain.errors, chain.model, chain.tip_mm, chain.q_touch, known=True)
-    outward_ct = -(chain.T_base_ct[:3, :3].T @ flange_pose(chain.model, chain.q_insertion)[:3, 2])
-    puncture = Puncture(
-        chain.model, chain.tip_mm, chain.method, noise, chain.points_ct, chain.q_touch, chain.T_base_ct,
-        chain.target_ct, outward_ct, chain.q_insertion, Path.bend,
-    )  # fmt: skip
     rng = np.random.default_rng(11)
-    rooms = draw_trials(puncture, chain.errors, ROOMS, rng)
-    rooms = rooms.of(rooms.reached)
+    rooms = drawn_trials(chain, chain.errors, ROOMS, rng, Path.bend)
     one = both.breathing
     s = drawn_positions(one, len(rooms.tip_ct), rng)
     target = rooms.target_ct[: len(s)] + (s - one.scanned_at)[:, None] * one.amplitude_mm * one.direction_ct
@@ -135,7 +116,7 @@ target_sd_mm = [0.4, 0.4, 1.0]
 """
 
 
-def test_register_shows_them_where_they_are_declared(tmp_path):
+def test_register_shows_them_where_they_are_declared(tmp_path, run):
     ball(tmp_path / "skin.stl", 100.0, (0, 0, 0))
     ball(tmp_path / "organ.stl", 20.0, (0, 0, 0))
     markers = [("A", 90.0, 10.0, 40.0), ("B", -80.0, 20.0, 55.0), ("C", 5.0, -85.0, 50.0), ("D", 10.0, 80.0, 58.0)]
@@ -147,9 +128,9 @@ def test_register_shows_them_where_they_are_declared(tmp_path):
     ball(tmp_path / "rib.stl", 5.0, (40, 0, 40))
     avoided = structure("rib", "avoid", margin_mm=3.0)
     (tmp_path / "case.toml").write_text(case_text(BODY + rest, SKIN, ORGAN, avoided, needle=needle))
-    done = CliRunner().invoke(app, ["register", str(tmp_path), "--json"])
-    assert done.exit_code == 0, done.exception
-    budget = json.loads(done.stdout)["budget"]
+    code, found = run("register", tmp_path)
+    assert code == 0
+    budget = found["budget"]
     costs = {one["text"]: one["alone_mm"] for one in budget["sources"]}
     assert 0.1 < costs["bending of the needle"] < 10
     assert costs["breathing while it is inserted"] == pytest.approx(12 * mean_square_within(0.25, 2, 0.0) ** 0.5)

@@ -1,41 +1,28 @@
 """The error budget: what each source costs against rooms drawn with it alone, and what changes must obey."""
 
-import json
 from dataclasses import fields, replace
-from functools import cache
 
 import numpy as np
 import pytest
+from budget_world import chain, drawn_trials
 from places import ROOT
-from typer.testing import CliRunner
+from refusals import refused_command
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.budget.chain import chain_of
 from puncture_twin.planning.budget.what_if import MOST_MARKERS, best_change, changes, source_costs
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import ArmUncertainty
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise
-from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.registration import reached_insertion
 from puncture_twin.planning.uncertainty.sources import reading_parts
-from puncture_twin.run_twin import app
-from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
+from puncture_twin.run_twin import main
 
 ABDOMEN_CASE, CARTON_CASE = "abdomen/case.toml", "carton/case_m_setup2.toml"
 BEDS = {ABDOMEN_CASE: (0.0, 0.0, 1.0), CARTON_CASE: (1.0, 0.0, 0.0)}
 """Of each case, the direction across its slices."""
 ABDOMEN = ROOT / "meshes" / "abdomen"
 NOTHING = ArmUncertainty(**{field.name: 0.0 for field in fields(ArmUncertainty)})
-
-
-@cache
-def chain(name):
-    case = load_case(ROOT / "meshes" / name)
-    placement = load_placement(case)
-    return chain_of(case, placement.registration, reached_insertion(case, placement.T_base_ct))
 
 
 @pytest.fixture(scope="module", params=BEDS)
@@ -80,14 +67,7 @@ SOURCES = ["ct_slice", "touch", "target", "link", "drift"]
 def test_rooms_drawn_with_one_source_err_as_it_costs(name, source):
     """Whole nonlinear chains, 4,000 of them: their rms is known to 1 %."""
     one = chain(name)
-    noise = reading_noise(one.errors, one.model, one.tip_mm, one.q_touch, known=True)
-    outward_ct = -(one.T_base_ct[:3, :3].T @ flange_pose(one.model, one.q_insertion)[:3, 2])
-    puncture = Puncture(
-        one.model, one.tip_mm, one.method, noise, one.points_ct, one.q_touch, one.T_base_ct, one.target_ct, outward_ct,
-        one.q_insertion,
-    )  # fmt: skip
-    rooms = draw_trials(puncture, _alone(one.errors, source), 4000, np.random.default_rng(6))
-    rooms = rooms.of(rooms.reached)
+    rooms = drawn_trials(one, _alone(one.errors, source), 4000, np.random.default_rng(6))
     realised = np.sqrt(np.mean(np.sum((rooms.tip_ct - rooms.target_ct) ** 2, axis=1)))
     predicted = {cost.source: cost.alone_mm for cost in source_costs(one)}[source]
     assert realised == pytest.approx(predicted, rel=0.03)
@@ -116,16 +96,14 @@ def test_slices_as_they_are_change_nothing():
     assert same[0].rms_mm == pytest.approx(one.expected_mm())
 
 
-def test_register_prints_the_budget_and_draws_it(tmp_path):
+def test_register_prints_the_budget_and_draws_it(tmp_path, run, capfd):
     """Each source, each change, and what wins most; a name that is no PNG's is refused in one line."""
-    done = CliRunner().invoke(app, ["register", str(ABDOMEN), "--json", "--picture", str(tmp_path / "budget.png")])
-    budget = json.loads(done.stdout)["budget"]
+    budget = run("register", ABDOMEN, "--picture", tmp_path / "budget.png")[1]["budget"]
     assert (tmp_path / "budget.png").read_bytes().startswith(b"\x89PNG")
     assert sum(one["alone_mm"] ** 2 for one in budget["sources"]) == pytest.approx(budget["expected_mm"] ** 2)
     across, along = budget["expected_lateral_mm"], budget["expected_depth_mm"]
     assert across**2 + along**2 == pytest.approx(budget["expected_mm"] ** 2) and 0 < along < across
     assert budget["best"]["expected_mm"] == min(one["expected_mm"] for one in budget["changes"])
-    text = CliRunner().invoke(app, ["register", str(ABDOMEN)]).stdout
-    assert "mm would be gained by" in text
-    refused = CliRunner().invoke(app, ["register", str(ABDOMEN), "--picture", str(tmp_path / "budget.txt")])
-    assert "not the name of a PNG file" in str(refused.exception)
+    assert main(["register", str(ABDOMEN)]) == 0 and "mm would be gained by" in capfd.readouterr().out
+    line = refused_command(["register", ABDOMEN, "--picture", tmp_path / "budget.txt"], capfd, "bad_file_name")
+    assert "not the name of a PNG file" in line

@@ -32,11 +32,10 @@ def test_a_grid_has_round_degrees_in_every_table(searched):
     assert angles == {6.0 * step for step in range(11)}
 
 
-def test_the_csv_is_the_table(searched, tmp_path, capsys):
+def test_the_csv_is_the_table(searched, tmp_path, run):
     """Read by Python's own reader: every number to the last digit, nothing where there is none."""
-    arguments = ["export", str(searched[1]), "--format", "candidates-csv", "--out", str(tmp_path), "--json"]
-    assert main(arguments) == OK
-    told = json.loads(capsys.readouterr().out)
+    code, told = run("export", searched[1], "--format", "candidates-csv", "--out", tmp_path)
+    assert code == OK
     with (tmp_path / "candidates.csv").open(newline="") as stream:
         read = list(csv.DictReader(stream))
     rows = expected(searched[1])
@@ -50,27 +49,24 @@ def test_the_csv_is_the_table(searched, tmp_path, capsys):
     assert [one["role"] for one in told["inputs"]][:2] == ["candidates", "case"]
 
 
-def test_the_json_is_the_table_with_its_origin(searched, tmp_path, capsys):
+def test_the_json_is_the_table_with_its_origin(searched, tmp_path):
     """Columns once, a list a row; the run's case, version and hashes beside them."""
     table = searched[1] / "candidates.parquet"
     assert main(["export", str(table), "--format", "candidates-json", "--out", str(tmp_path)]) == OK
-    capsys.readouterr()
     read = json.loads((tmp_path / "candidates.json").read_text())
     assert [dict(zip(read["columns"], row, strict=True)) for row in read["rows"]] == expected(searched[1])
     assert read["run"] == json.loads(pq.read_schema(table).metadata[b"run"])
 
 
-def test_a_case_is_searched_first(searched, tmp_path, capsys):
+def test_a_case_is_searched_first(searched, tmp_path):
     """Its table lies beside the text, in one set; the arm is checked only where the case says where it is."""
     case, out = searched
     text = case.read_text()
     other = case.with_name("other.toml")
     other.write_text(text[: text.index("[registration]")] + text[text.index("[[structure]]") :])
     assert main(["export", str(other), "--format", "candidates-csv", "--out", str(tmp_path)]) == OK
-    capsys.readouterr()
-    assert {path.name for path in tmp_path.iterdir()} == {
-        *("candidates.csv", "candidates.parquet", "manifest.json", "timings.json")
-    }
+    names = {"candidates.csv", "candidates.parquet", "manifest.json", "timings.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
     assert len(expected(tmp_path)) == len(expected(out))
 
 

@@ -16,25 +16,19 @@ from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, OK
 RAS = np.array([-1.0, -1.0, 1.0])
 
 
-def run(capsys, *arguments):
-    code = main(["check", *map(str, arguments), "--no-arm", "--json"])
-    out = capsys.readouterr().out
-    return code, json.loads(out) if out else None
-
-
 def write(path, *lines):
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
-def test_entries_are_checked_as_each_alone(context, tmp_path, capsys):
+def test_entries_are_checked_as_each_alone(context, tmp_path, run):
     """One row out for one in, in order; an entry that is none is a row that says so; the list's hash is an input."""
     found = context.search()
     rows = [found.ranked[0], found.ranked[-1], int(np.flatnonzero(~found.safe & np.isfinite(found.path.length))[0])]
     points = [found.path.entry_ct[row] * RAS for row in rows] + [0.5 * found.path.entry_ct[rows[0]] * RAS]
     lines = [f"{name},{','.join(f'{x:.9f}' for x in point)}" for name, point in zip("abcd", points, strict=True)]
     listed = write(tmp_path / "entries.csv", "name,x_mm,y_mm,z_mm", *lines)
-    code, told = run(capsys, context.case.path, "--entries", listed, "--out", tmp_path / "out")
+    code, told = run("check", context.case.path, "--no-arm", "--entries", listed, "--out", tmp_path / "out")
     assert code == ANSWER_IS_NO
     assert [row["verdict"] for row in told["rows"]] == ["safe", "safe", "rejected", "refused"]
     assert "enters the skin" in told["rows"][3]["detail"]
@@ -55,25 +49,26 @@ def test_entries_are_checked_as_each_alone(context, tmp_path, capsys):
     assert manifest["entries"]["check list"]["inputs"][0]["sha256"] == digest
 
 
-def test_angles_are_a_list_of_entries_too(context, tmp_path, capsys):
+def test_angles_are_a_list_of_entries_too(context, tmp_path, run, capfd):
     found = context.search()
     lines = [f"{at['theta_deg']},{at['beta_deg']}" for at in map(found.at, found.ranked[:3])]
-    code, told = run(
-        capsys, context.case.path, "--entries", write(tmp_path / "angles.csv", "theta_deg,beta_deg", *lines)
-    )
+    command = ["check", str(context.case.path), "--no-arm", "--entries", str(tmp_path / "angles.csv")]
+    write(tmp_path / "angles.csv", "theta_deg,beta_deg", *lines)
+    code, told = run(*command)
     assert code == OK
     assert [row["path_length_mm"] for row in told["rows"]] == pytest.approx(found.path.length[found.ranked[:3]])
-    assert main(["check", str(context.case.path), "--no-arm", "--entries", str(tmp_path / "angles.csv")]) == OK
-    assert len([line for line in capsys.readouterr().out.splitlines() if line.split()[1:2] == ["safe"]]) == 3
+    assert main(command) == OK
+    assert len([line for line in capfd.readouterr().out.splitlines() if line.split()[1:2] == ["safe"]]) == 3
 
 
-def test_each_target_is_what_a_case_with_that_target_says(context, another, tmp_path, capsys):
+def test_each_target_is_what_a_case_with_that_target_says(context, another, tmp_path, run):
     """Also the direction that was chosen for all; a target outside of the body is a row that says why."""
     points = {"first": (5.0, 3.0, -4.0), "outside": (300.0, 0.0, 0.0)}
     listed = write(
         tmp_path / "t.csv", "name,x_mm,y_mm,z_mm", *(f"{name},{x},{y},{z}" for name, (x, y, z) in points.items())
     )
-    code, told = run(capsys, context.case.path, "--targets", listed)
+    command = ["check", context.case.path, "--no-arm", "--targets", listed]
+    code, told = run(*command)
     assert code == ANSWER_IS_NO
     alone = another(("position_mm = [0.0, 0.0, 0.0]", "position_mm = [5.0, 3.0, -4.0]"))
     found = alone.search()
@@ -82,7 +77,7 @@ def test_each_target_is_what_a_case_with_that_target_says(context, another, tmp_
     assert first["theta_deg"] == found.at(found.ranked[0])["theta_deg"]
     assert first["min_clearance_mm"] == pytest.approx(float(found.clearance.least[found.ranked[0]]))
     assert (second["verdict"], second["safe_directions"]) == ("refused", None) and second["detail"]
-    code, told = run(capsys, context.case.path, "--targets", listed, "--theta", 10, "--beta", 90)
+    code, told = run(*command, "--theta", 10, "--beta", 90)
     explained = alone.explain(np.radians(10), np.radians(90)).summary()
     assert told["rows"][0]["path_length_mm"] == pytest.approx(explained["path_length_mm"])
 
@@ -120,10 +115,10 @@ def test_what_does_not_go_together_is_refused(context, arguments, capsys):
 
 
 @pytest.mark.parametrize(("end", "warned"), [("\n", False), ("", True)])
-def test_a_list_that_may_be_cut_within_a_number_is_told(context, tmp_path, capsys, end, warned):
+def test_a_list_that_may_be_cut_within_a_number_is_told(context, tmp_path, run, end, warned):
     """`30,100` cut to `30,10` is another direction, and looks whole."""
     path = tmp_path / "entries.csv"
     path.write_text("theta_deg,beta_deg\n10,20\n30,10" + end)
-    _, told = run(capsys, context.case.path, "--entries", path)
+    _, told = run("check", context.case.path, "--no-arm", "--entries", path)
     assert [row["beta_deg"] for row in told["rows"]] == [20.0, 10.0]
     assert any("entries.csv: its last line has no line break at its end" in one for one in told["warnings"]) == warned

@@ -1,12 +1,11 @@
 """Two paths side by side: each side is what `check` says of it, whichever way it was chosen."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from case_world import coarse_carton
 from refusals import refused
+from uncertainty_world import ball
 
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.plan.planner import make_plan
@@ -41,18 +40,17 @@ def test_each_side_is_what_check_says_of_it(context):
     assert done.a.summary()["search"]["window_square_deg"] == windows.windows[0].square_deg
 
 
-def test_a_rejected_side_is_said_with_its_reason_and_exit_code_1(context, capsys):
+def test_a_rejected_side_is_said_with_its_reason_and_exit_code_1(context, run, capfd):
     found = context.search()
     row = int(np.flatnonzero(~found.safe)[0])
     at = found.at(row)
     arguments = ["--theta", str(at["theta_deg"]), "--beta", str(at["beta_deg"]), "--no-arm"]
     assert main(["compare", str(context.case.path), *arguments]) == ANSWER_IS_NO
-    text = capsys.readouterr().out
+    text = capfd.readouterr().out
     assert f"B is rejected: {found.verdict.reason[row]}" in text
     assert "rank 1" in text and "safe for the organs" in text
-    assert main(["compare", str(context.case.path), "--rank", "1", "--rank", "2", "--no-arm", "--json"]) == OK
-    told = json.loads(capsys.readouterr().out)
-    assert [told[side]["search"]["rank"] for side in "ab"] == [1, 2]
+    code, told = run("compare", context.case.path, "--rank", 1, "--rank", 2, "--no-arm")
+    assert code == OK and [told[side]["search"]["rank"] for side in "ab"] == [1, 2]
     assert told["b"]["plan"] is None and told["inputs"]
 
 
@@ -80,31 +78,29 @@ def test_a_plan_and_a_case_are_not_mixed(tmp_path):
     assert two_plans(plan, plan, None, False) == (plan, plan)
 
 
-def test_two_plans_by_what_they_state_and_with_their_case_by_what_holds(tmp_path, capsys):
+def test_two_plans_by_what_they_state_and_with_their_case_by_what_holds(tmp_path, run, capfd):
     """Chances are those of the plans' own configurations; a plan that holds no more is refused."""
-    case = coarse_carton(tmp_path / "carton")
+    case = ball(tmp_path, errors="touch_mm = 0.2")
     context = prepare(case)
     search, names = context.search(), [tmp_path / "a.json", tmp_path / "b.json"]
     plans = [make_plan(context, search, Choice(rank=k)).plan for k in (1, 2)]
     for plan, name in zip(plans, names, strict=True):
         write_plan(plan, name)
     paths = [str(name) for name in names]
-    assert main(["compare", *paths, "--json"]) == OK
-    told = json.loads(capsys.readouterr().out)
-    assert told["a"]["check"] is None
+    code, told = run("compare", *paths)
+    assert code == OK and told["a"]["check"] is None
     assert [told[side]["plan"]["theta_deg"] for side in "ab"] == [np.degrees(plan.theta) for plan in plans]
     assert main(["compare", *paths]) == OK
-    shown = capsys.readouterr().out
+    shown = capfd.readouterr().out
     assert "--case CASE checks them again" in shown and "different files" not in shown
     changed = [replace(one, sha256="0" * 64) if one.role == "markers_ct" else one for one in plans[1].inputs]
     write_plan(replace(plans[1], inputs=tuple(changed)), tmp_path / "other.json")
     assert main(["compare", paths[0], str(tmp_path / "other.json")]) == OK
-    assert "made from different files (markers_ct): are they of one case?" in capsys.readouterr().out
-    assert main(["compare", *paths, "--case", str(case), "--json"]) == OK
-    told = json.loads(capsys.readouterr().out)
+    assert "made from different files (markers_ct): are they of one case?" in capfd.readouterr().out
+    code, told = run("compare", *paths, "--case", case)
+    assert code == OK
     for side, plan in zip("ab", plans, strict=True):
         breakdown = context.breakdown_at(plan.outward_ct, plan.insertion.q[-1])
         assert told[side]["check"]["chances"]["p_hit"] == pytest.approx(breakdown.p_hit, abs=1e-9)
     case.write_text(case.read_text() + "\n# other\n")
     assert main(["compare", *paths, "--case", str(case)]) == BAD_INPUT
-    capsys.readouterr()

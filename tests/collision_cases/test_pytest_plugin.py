@@ -8,9 +8,9 @@ import pytest
 from places import ROOT
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.search.context import prepare
 
 pytest_plugins = ["pytester"]
+pytestmark = pytest.mark.usefixtures("kernels_loaded")
 
 CARTON = folder() / "carton" / "case_m.toml"
 GOOD = f"""
@@ -22,14 +22,6 @@ verdict = "safe"
 clearance_mm = {{ bolt_h = 5.0 }}
 tolerance_mm = 0.02
 """
-
-
-@pytest.fixture(autouse=True, scope="module")
-def kernels_loaded():
-    """Run compiled code once: pytester forgets modules that it saw imported, and numba's register only once."""
-    import puncture_twin.planning.collision_cases.collector  # noqa: F401  # and OMPL, which loads once too
-
-    prepare(CARTON, arm=False).check(0.0, 0.0)
 
 
 def run(pytester, text):

@@ -8,11 +8,10 @@ from hypothesis import given, strategies as st
 from refusals import refused
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.collision_cases.checks_file import line_of, table_lines
 from puncture_twin.planning.collision_cases.session import Change, NewNumber, rewrite
-from puncture_twin.planning.search.context import prepare
 
 pytest_plugins = ["pytester"]
-
 CARTON = folder() / "carton" / "case_m.toml"
 FILE = f"""\
 # What holds of the carton.
@@ -38,14 +37,7 @@ clearance_mm = {{ bolt_h = 5.2 }}
 """
 
 
-@pytest.fixture(autouse=True, scope="module")
-def kernels_loaded():
-    """Run compiled code once: pytester forgets modules that it saw imported, and numba's register only once."""
-    import puncture_twin.planning.collision_cases.collector  # noqa: F401  # and OMPL, which loads once too
-
-    prepare(CARTON, arm=False).check(0.0, 0.0)
-
-
+@pytest.mark.usefixtures("kernels_loaded")
 def test_numbers_are_rewritten_and_verdicts_never(pytester):
     """Afterwards the first check passes, the second fails as before, and the file differs in two numbers."""
     file = pytester.path / "some.collision.toml"
@@ -91,6 +83,7 @@ def test_every_way_of_writing_a_table_stays(tmp_path, text, old, new):
     assert file.read_bytes() == text.format(new).encode()
 
 
+@pytest.mark.usefixtures("kernels_loaded")
 def test_two_processes_do_not_rewrite_one_file(pytester):
     result = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-n", "2", "--collision-update")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
@@ -108,3 +101,43 @@ def test_what_is_written_is_near_and_on_the_right_side(value, within, old):
     exact = Decimal(repr(value))  # as it is read; a difference of floats rounds, above 1e-9 by 4e-13 at 4096
     assert least <= exact <= most
     assert max(abs(near - exact), exact - least, most - exact) <= Decimal(repr(within))
+
+
+TEXT = '''case = "x" # [[check]]
+[[check]]
+why = """
+[[check]]
+\\""" [[check]]
+"""
+  [[ check ]] # two
+theta_deg = 1
+note = "# [[check]]"
+[[window]]
+theta_deg = 2
+[[check]]
+why = \'\'\'
+[[check]]\'\'\'
+'''
+
+
+def test_only_heads_of_tables_count():
+    """Not what stands in strings and comments; as many as TOML's own reader finds."""
+    assert table_lines(TEXT, "check") == [2, 7, 12]
+    assert len(tomllib.loads(TEXT)["check"]) == 3
+    assert table_lines(TEXT, "window") == [10]
+
+
+@pytest.mark.parametrize(
+    ("place", "line"),
+    [
+        (("check", 1, "theta_deg"), 8),
+        (("check", 1, "verdict"), 7),
+        (("check", 0), 2),
+        (("window", 0, "theta_deg"), 11),
+        (("check", 3), None),
+        (("case",), 1),
+        ((), None),
+    ],
+)
+def test_a_place_has_the_line_of_its_key_or_of_its_table(place, line):
+    assert line_of(TEXT, place) == line

@@ -199,7 +199,7 @@ def test_what_is_none_is_refused_in_one_line(context, name, arguments, code):
 
 @pytest.fixture(scope="module")
 def arm_context(tmp_path_factory):
-    return pt.prepare(coarse_carton(tmp_path_factory.mktemp("arm") / "carton"))
+    return pt.prepare(coarse_carton(tmp_path_factory.mktemp("arm") / "carton", 15.0))
 
 
 @pytest.fixture(scope="module")
@@ -365,8 +365,8 @@ def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, arm_contex
         ):
             with refused("input_changed"):
                 ask()
-        back = pt.prepare(other.case.replace(target_ct=case.target_ct, needle={"diameter_mm": case.needle.diameter_mm}))
-        assert same_candidates(pt.search(pt.prepare(back.case, arm=False)), candidates)
+        back = other.case.replace(target_ct=case.target_ct, needle={"diameter_mm": case.needle.diameter_mm})
+        assert same_candidates(pt.search(pt.prepare(back, arm=False)), candidates)
     assert not list(tmp_path.iterdir())
     best = candidates.best
     for wrong, code in (((best.candidates, 10**9), "out_of_range"), (("x", 0), "wrong_type")):

@@ -26,26 +26,21 @@ TARGET = (50.0, 130.0, 63.0)
 
 
 @pytest.fixture(scope="module")
-def context():
-    return pt.prepare(CARTON / "case_m.toml", arm=False)
-
-
-@pytest.fixture(scope="module")
-def given(context, tmp_path_factory):
+def given(tmp_path_factory):
     tmp = tmp_path_factory.mktemp("values")
-    recorded = simulate_recording(np.random.default_rng(1), 24)[0]
-    write_recording(recorded, tmp / "recording.csv")
+    write_recording(simulate_recording(np.random.default_rng(1), 24)[0], tmp / "recording.csv")
+    write_pairs(tmp / "pairs.csv", hand_eye_problem(np.random.default_rng(1), 8)[0])
     carton = coarse_carton(tmp / "carton")
     carton.write_text(changed(carton.read_text(), ("[end]", "[stereo]\n[ultrasound]\n[end]")))
-    armed = pt.prepare(carton)
-    write_pairs(tmp / "pairs.csv", hand_eye_problem(np.random.default_rng(1), 8)[0])
-    candidates = pt.search(context)
-    plan = pt.plan(armed)
+    context, armed = pt.prepare(carton, arm=False), pt.prepare(carton)
+    candidates, found = pt.search(context), pt.search(armed)
+    plan = pt.plan(armed, found)
     pt.write_plan(plan, tmp / "plan.json")
     certificate = pt.certify(context, size_deg=10.0)
     markers = [pt.read_points(CARTON / name) for name in ("markers_ct.csv", "touch.csv")]
     return {
-        "tmp": tmp, "armed": armed, "context": context, "candidates": candidates, "plan": plan,
+        "tmp": tmp, "armed": armed, "context": context, "candidates": candidates, "found": found,
+        "plan": plan,
         "certificate": certificate, "markers_ct": markers[0], "markers_base": markers[1], "points": markers[0],
         "recording": pt.read_recording(tmp), "pairs": pt.read_pose_pairs(tmp / "pairs.csv"),
         "calibration": pt.calibrate(pt.read_recording(tmp)),
@@ -58,8 +53,9 @@ def given(context, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def values(given):
-    tmp, armed, context, candidates = (given[name] for name in ("tmp", "armed", "context", "candidates"))
-    found, plan = pt.search(armed), given["plan"]
+    tmp, armed, context, candidates, found, plan = (
+        given[name] for name in ("tmp", "armed", "context", "candidates", "found", "plan")
+    )
     rehearsal = pt.rehearse(armed, plan, seeds=3)
     return {
         "init_case": context.case,
@@ -180,9 +176,19 @@ HOSTILE = {
 }
 
 
+def answered(call, what):
+    """An answer, or one line; never an error of NumPy's or Python's."""
+    try:
+        call()
+    except pt.PlanningError as error:
+        assert str(error).isprintable() and len(str(error)) < 1600, what
+    except Exception as error:
+        pytest.fail(f"{what}: {type(error).__name__}: {error}")
+
+
 @pytest.mark.parametrize("name", sorted(FUNCTIONS))
 def test_no_foreign_exception_leaves_a_function(name, given, tmp_path, monkeypatch):
-    """Whatever one argument is, beside good ones: an answer, or one line; never an error of NumPy's or Python's."""
+    """Whatever one argument is, beside good ones."""
     monkeypatch.chdir(tmp_path)  # a text is a folder too
     function, parameters = FUNCTIONS[name], inspect.signature(FUNCTIONS[name]).parameters
     context = (
@@ -192,15 +198,8 @@ def test_no_foreign_exception_leaves_a_function(name, given, tmp_path, monkeypat
     required = {key: good[key] for key, one in parameters.items() if one.default is inspect.Parameter.empty}
     for key, one in parameters.items():
         for label, value in HOSTILE.items():
-            if value is one.default:
-                continue
-            call = partial(function, **{**required, key: value})
-            try:
-                call()
-            except pt.PlanningError as error:
-                assert str(error).isprintable() and len(str(error)) < 1600, f"{key} {label}"
-            except Exception as error:
-                pytest.fail(f"{name}({key}={label}): {type(error).__name__}: {error}")
+            if value is not one.default:
+                answered(partial(function, **{**required, key: value}), f"{name}({key}={label})")
 
 
 @pytest.mark.parametrize("label", HOSTILE)
@@ -210,9 +209,4 @@ def test_no_foreign_exception_leaves_a_case_or_its_candidates(label, given):
     calls += [partial(case.replace, needle={"length_mm": value}), partial(candidates.pick, value)]
     calls += [] if isinstance(value, str) and label == "text" else [partial(candidates.write, value)]
     for call in calls:
-        try:
-            call()
-        except pt.PlanningError as error:
-            assert str(error).isprintable()
-        except Exception as error:
-            pytest.fail(f"{call}: {type(error).__name__}: {error}")
+        answered(call, call)

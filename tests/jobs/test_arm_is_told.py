@@ -1,7 +1,5 @@
 """A result that asked no arm says so wherever it is read: terminal, JSON, page; pytest is in tests/collision_cases."""
 
-import json
-
 import numpy as np
 import pytest
 from case_world import coarse_carton
@@ -36,11 +34,11 @@ def test_terminal_and_page_say_that_no_arm_was_checked(nowhere, tmp_path, capfd)
 
 
 @pytest.mark.parametrize("switch", [[], ["--no-arm"]])
-def test_check_says_so_too(nowhere, switch, capfd):
+def test_check_says_so_too(nowhere, switch, run, capfd):
     """Verdict and arm stand beside each other in JSON; in text nothing reads "safe" alone."""
     candidate = ["check", str(nowhere), "--theta", "0", "--beta", "0", *switch]
-    assert main([*candidate, "--json"]) == OK
-    found = json.loads(capfd.readouterr().out)
+    code, found = run(*candidate)
+    assert code == OK
     assert (found["verdict"], found["arm"], found["reachable"]) == ("safe", NOT_CHECKED, None)
     assert switch or any(NAMED in warning for warning in found["warnings"])
     assert main(candidate) == OK

@@ -1,6 +1,7 @@
 """`confirm`: a rehearsed needle in a control scan, read, checked and answered; and what it says of the errors."""
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,52 +12,55 @@ from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.patient.confirm_job import ScanFiles, _body, confirm_needle
+from puncture_twin.twin.jobs.patient.confirm_job import ScanFiles, _body, confirm_needle, learn
 from puncture_twin.twin.plant.scanner.case_scene import TrueRod, VirtualScanner, case_scene
 from puncture_twin.twin.plant.scanner.image import ScanSettings
-from puncture_twin.twin.plant.scanner.writers import write_nifti, write_series
+from puncture_twin.twin.plant.scanner.writers import write_nifti
 
 CASE = folder() / "abdomen"
 OUTWARD = np.array([-0.89, -0.437, -0.126]) / np.linalg.norm([-0.89, -0.437, -0.126])
 
 
-def scanner(off, *, needle=True):
-    """140 mm of a patient, rotated by 3 degrees, the tip ``off`` the target: slices are coarse."""
-    context = prepare(CASE, arm=False)
-    settings = ScanSettings(3.0, 1.2, 15.0, length_mm=140.0, turn=np.radians(3.0))
-    rng = np.random.default_rng(1)
-    rod = TrueRod(context.case.target_ct + np.array(off), -OUTWARD) if needle else None
-    return VirtualScanner(case_scene(context.case, context.anatomy, settings, rng, needle=rod), settings, rng)
+first_scan = cache(VirtualScanner.image)
 
 
-def scanned(place, off, *, needle=True, series=False):
-    device = scanner(off, needle=needle)
-    image, T = device.image(), device.scene.T_scan_ct
-    if series:
-        write_series(place / "series", image, device.settings, "control", "abdomen")
-        return place / "series", T
-    return write_nifti(place / "control.nii.gz", image.hu, image.grid.T_ct_index), T
+class OneScan(VirtualScanner):
+    """Each of its scans is the first."""
+
+    def image(self):
+        return first_scan(self)
 
 
 @pytest.fixture(scope="module")
-def control(tmp_path_factory):
-    place = tmp_path_factory.mktemp("control")
-    return place, *scanned(place, 4.0 * OUTWARD)
+def context():
+    return prepare(CASE, arm=False)
+
+
+@pytest.fixture(scope="module")
+def scanner(context):
+    """Of 140 mm of a patient, rotated by 3 degrees, the tip 4 mm off the target: slices are coarse."""
+    settings, rng = ScanSettings(3.0, 1.2, 15.0, length_mm=140.0, turn=np.radians(3.0)), np.random.default_rng(1)
+    rod = TrueRod(context.case.target_ct + 4.0 * OUTWARD, -OUTWARD)
+    return OneScan(case_scene(context.case, context.anatomy, settings, rng, needle=rod), settings, rng)
+
+
+@pytest.fixture(scope="module")
+def control(scanner, tmp_path_factory):
+    image = scanner.image()
+    return write_nifti(tmp_path_factory.mktemp("control") / "control.nii.gz", image.hu, image.grid.T_ct_index)
 
 
 @pytest.fixture(scope="module")
 def confirmed(control):
     """What the command says of its files, its exit code, and the names of what it wrote."""
-    place, file, _ = control
-    code = main(["confirm", str(CASE), "--scan", str(file), "--out", str(place / "out"), "--json"])
-    written = {one.name for one in (place / "out").iterdir()}
-    return code, json.loads((place / "out" / "confirm.json").read_text()), written
+    out = control.parent / "out"
+    code = main(["confirm", str(CASE), "--scan", str(control), "--out", str(out), "--json"])
+    return code, json.loads((out / "confirm.json").read_text()), {one.name for one in out.iterdir()}
 
 
-def test_a_needle_is_read_in_the_cases_frame(confirmed):
+def test_a_needle_is_read_in_the_cases_frame(context, confirmed):
     """Where it truly is, tied by markers over a rotation; its line safe as `check` has it; the next aim is deeper."""
     code, found, written = confirmed
-    context = prepare(CASE, arm=False)
     assert found["frames"]["tied_by"] == "markers"
     off = np.array(found["tip_ct_mm"]) - context.case.target_ct - 4.0 * OUTWARD
     assert np.linalg.norm(off) < 1.0
@@ -68,38 +72,34 @@ def test_a_needle_is_read_in_the_cases_frame(confirmed):
     assert "control ct" in {one["role"] for one in found["inputs"]}
 
 
-def test_a_scan_is_read_off_the_scanner_as_off_its_files(control, confirmed):
+def test_a_scan_is_read_off_the_scanner_as_off_its_files(context, scanner, control, confirmed):
     """Two devices of one protocol: the needle and what is to be done are the same; files are inputs, a scanner none."""
-    live, found = confirm_needle(prepare(CASE, arm=False), scanner(4.0 * OUTWARD)), confirmed[1]
+    live, found = confirm_needle(context, scanner), confirmed[1]
     np.testing.assert_allclose(live.needle.tip_ct, found["tip_ct_mm"], atol=1e-4)
     np.testing.assert_allclose(live.needle.cov_ct[:3, :3], found["tip_cov_mm2"], rtol=1e-3)
     np.testing.assert_allclose(live.needle.cov_ct[3:, 3:], found["axis_cov_rad2"], rtol=1e-3)
     assert [one.kind for one in live.aims] == [one["kind"] for one in found["aims"]]
-    assert not live.read and [one.role for one in ScanFiles(control[1]).measured_scan().inputs] == ["control ct"]
+    assert not live.read and [one.role for one in ScanFiles(control).measured_scan().inputs] == ["control ct"]
 
 
-def test_every_bone_ties_the_frames():
+def test_every_bone_ties_the_frames(context):
     """Ribs, sternum and pelvis too, whose names have a side or a number; organs are what is no bone."""
-    context = prepare(CASE, arm=False)
     known = _body(context)
     counts = [len(np.unique(one.structure)) for one in (known.sample, known.organs)]
     assert counts == [1 + 6, len(context.anatomy.structures) - 6]
 
 
-def test_a_mirrored_scan_and_one_without_a_needle(tmp_path, capfd, control):
+def test_a_mirrored_scan_and_one_without_a_needle(tmp_path, capfd, context, scanner, control):
     """One line each, exit 2, nothing written."""
-    _, file, T_scan_ct = control
-    volume = read_volume(file)
+    volume, T_scan_ct = read_volume(control), scanner.scene.T_scan_ct
     mirrored = write_nifti(tmp_path / "mirrored.nii.gz", np.ascontiguousarray(volume.values[::-1]), volume.T_ct_index)
     refused_command(["confirm", CASE, "--scan", mirrored, "--out", tmp_path / "out"], capfd, "mirrored")
-    values = volume.values.copy()
-    index = np.indices(values.shape).reshape(3, -1).T
-    target = prepare(CASE, arm=False).case.target_ct
-    away = apply(volume.T_ct_index, index.astype(float)) - apply(T_scan_ct, target)
+    values, dense = volume.values.copy(), np.argwhere(volume.values > 300)
+    away = apply(volume.T_ct_index, dense.astype(float)) - apply(T_scan_ct, context.case.target_ct)
     outward = T_scan_ct[:3, :3] @ OUTWARD
     along = away @ outward
-    near = (np.linalg.norm(away - along[:, None] * outward, axis=1) < 7.0) & (along > 0)
-    values.reshape(-1)[near & (values.reshape(-1) > 300)] = 40
+    needle = (np.linalg.norm(away - along[:, None] * outward, axis=1) < 7.0) & (along > 0)
+    values[tuple(dense[needle].T)] = 40
     bare = write_nifti(tmp_path / "bare.nii.gz", values, volume.T_ct_index)
     refused_command(["confirm", CASE, "--scan", bare, "--out", tmp_path / "out"], capfd, "needle_not_seen")
     assert not (tmp_path / "out").exists()
@@ -132,19 +132,16 @@ def confirmations(folder, scale, count, seed=0):
     return [word for number in range(count) for word in ("--learn", folder / f"{number}.json")]
 
 
-def test_needles_tell_the_size_of_the_errors(tmp_path, capfd):
+def test_needles_tell_the_size_of_the_errors(tmp_path, run, capfd):
     """Twice as large as declared, in 40 needles: the interval holds 2 and not 1; in three it says that they are few."""
-    assert main(["confirm", *map(str, confirmations(tmp_path, 2.0, 40)), "--json"]) == 0
-    found = json.loads(capfd.readouterr().out)
-    assert found["needles"] == 40 and 1.0 < found["low"] < 2.0 < found["high"]
+    code, found = run("confirm", *confirmations(tmp_path, 2.0, 40))
+    assert code == 0 and found["needles"] == 40 and 1.0 < found["low"] < 2.0 < found["high"]
     assert main(["confirm", *map(str, confirmations(tmp_path, 1.0, 3))]) == 0
     assert "say little" in capfd.readouterr().out
 
 
 def test_the_interval_holds_the_truth_95_times_in_a_hundred(tmp_path):
     """200 times 8 needles."""
-    from puncture_twin.twin.jobs.patient.confirm_job import learn
-
     held = 0
     for seed in range(200):
         learned = learn([path for path in confirmations(tmp_path, 1.5, 8, seed) if path != "--learn"])

@@ -9,6 +9,7 @@ import notebooks
 import pytest
 from case_world import coarse_carton
 from places import ROOT
+from uncertainty_world import ball
 
 EXAMPLES = sorted([*(ROOT / "examples").glob("*.py"), *(ROOT / "examples").glob("*.ipynb")])
 SAYS = {
@@ -22,17 +23,16 @@ SAYS = {
     "08": "safe directions with wider margins",
     "09": "safe: theta",
 }
-
-
-WITH = {"04": ["{}"], "05": ["{}", "4"], "06": ["{}"]}
-"""Of a coarse case, what takes a quarter of a minute of the embedded ones."""
+WITH = {"04": ["{ball}"], "05": ["{carton}", "4"], "06": ["{ball}"]}
+"""Of a small case, what takes a quarter of a minute of the embedded ones."""
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_and_says_its_answer(path, tmp_path, tmp_path_factory, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    case = coarse_carton(tmp_path_factory.mktemp("cases") / "carton")
-    monkeypatch.setattr(sys, "argv", [str(path), *(word.format(case) for word in WITH.get(path.name[:2], ()))])
+    cases = tmp_path_factory.mktemp("cases")
+    small = {"carton": coarse_carton(cases / "carton"), "ball": ball(cases, errors="touch_mm = 0.2")}
+    monkeypatch.setattr(sys, "argv", [str(path), *(word.format(**small) for word in WITH.get(path.name[:2], ()))])
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("scratch")))
     if path.suffix == ".ipynb":
         notebooks.run(path)

@@ -91,9 +91,9 @@ def plans(world):
     return [here / f"planned-{case.parent.name}" / "plan.json" for case in cases]
 
 
-def kills(command, entry, arguments, tells, out):
-    """Kill a command again and again, while it runs, and run it to its end after each kill."""
-    rng, counts = generator(command), Counter()
+def kills(command, entry, arguments, inputs, out):
+    """Kill a command again and again, while it runs, and run it to its end after each; its inputs tell the sets."""
+    rng, counts, tells = generator(command), Counter(), list(map(sha256, inputs))
     assert main([*map(str, arguments[0]), "--out", str(out)]) in (OK, ANSWER_IS_NO)
     old = 0
     for _ in range(TRIES * KILLS):
@@ -113,11 +113,22 @@ def kills(command, entry, arguments, tells, out):
     sys.stdout.write(said(command, counts) + "\n")
 
 
-@pytest.mark.parametrize("command", ["search", pytest.param("plan", marks=needs_time)])
-def test_a_command_killed_at_random(command, world, tmp_path):
-    cases = world[1]
-    options = ["--no-arm"] if command == "search" else []
-    kills(command, command, [[command, case, *options] for case in cases], [sha256(c) for c in cases], tmp_path / "out")
+OF_A_CASE = {
+    "search": ["search", "--no-arm"],
+    "plan": ["plan"],
+    "scan": ["scan", "--spacing", "5", "--pixel", "2"],
+    "touch": ["touch", "--theta", "18", "--beta", "232"],
+    "pivot": ["pivot", "--poses", "4"],
+    "markers": ["markers", "--propose", "4"],
+    "sweep": ["rehearse", "--theta", "18", "--beta", "232", "--sweep", "--to", "19,231"],
+}
+"""Entry to the command's words."""
+
+
+@pytest.mark.parametrize("entry", ["search", *(pytest.param(one, marks=needs_time) for one in list(OF_A_CASE)[1:])])
+def test_a_command_killed_at_random(entry, world, tmp_path):
+    verb, *options = OF_A_CASE[entry]
+    kills(entry, entry, [[verb, case, *options] for case in world[1]], world[1], tmp_path / "out")
 
 
 @needs_time
@@ -125,7 +136,7 @@ def test_search_killed_between_a_large_set_and_a_small_one(world, tmp_path):
     """Certificate, pictures and page in turn with the table alone: none of the large set stays beside the small one."""
     (large, small), options = world[1], ["--no-arm", "--certify", "--certify-size", "8"]
     runs = [["search", large, *options], ["search", small, "--no-arm", "--no-pictures"]]
-    kills("search, large and small", "search", runs, [sha256(case) for case in world[1]], tmp_path / "out")
+    kills("search, large and small", "search", runs, world[1], tmp_path / "out")
 
 
 def two_of(folder_of, file, changes, here):
@@ -138,13 +149,6 @@ def two_of(folder_of, file, changes, here):
 
 
 STEPS = [("step_deg = 2.0", f"step_deg = {step}") for step in ("15.0", "18.0")]
-EXPERIMENT = {
-    "scan": ["scan", "--spacing", "5", "--pixel", "2"],
-    "touch": ["touch", "--theta", "18", "--beta", "232"],
-    "pivot": ["pivot", "--poses", "4"],
-    "markers": ["markers", "--propose", "4"],
-    "sweep": ["rehearse", "--theta", "18", "--beta", "232", "--sweep", "--to", "19,231"],
-}
 OF_PLANS = {"rehearse": ("rehearse", ["rehearse"]), "export": ("export plan.csv", ["export", "--format", "csv"])}
 OWN_CASES = {
     "place": (folder() / "abdomen", "case.toml", STEPS, ["place", "--full"]),
@@ -161,15 +165,7 @@ def test_a_command_on_a_plan_killed_at_random(command, world, plans, tmp_path):
     runs = [[verb, plan, *options] for plan in plans]
     if command == "rehearse":
         runs = [[*run, "--case", case] for run, case in zip(runs, world[1], strict=True)]
-    kills(command, entry, runs, [sha256(plan) for plan in plans], tmp_path / "out")
-
-
-@needs_time
-@pytest.mark.parametrize("command", EXPERIMENT)
-def test_the_experiment_killed_at_random(command, world, tmp_path):
-    verb, *options = EXPERIMENT[command]
-    runs = [[verb, case, *options] for case in world[1]]
-    kills(command, command, runs, [sha256(case) for case in world[1]], tmp_path / "out")
+    kills(command, entry, runs, plans, tmp_path / "out")
 
 
 @needs_time
@@ -184,8 +180,7 @@ def test_a_command_on_a_case_of_its_own_killed_at_random(command, tmp_path):
     if command == "place":
         for case in cases:
             case.write_text(case.read_text() + PLACE)
-    runs = [[verb, case, *options] for case in cases]
-    kills(command, command, runs, list(map(sha256, cases)), tmp_path / "out")
+    kills(command, command, [[verb, case, *options] for case in cases], cases, tmp_path / "out")
 
 
 def state_by_page(out, old, new):

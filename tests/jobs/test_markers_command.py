@@ -30,13 +30,17 @@ def patient(tmp_path_factory):
     return true, here
 
 
-def test_markers_are_written_for_case_and_slicer(patient, tmp_path, capsys):
+def test_markers_are_written_for_case_and_slicer(patient, tmp_path, run):
     """As CSV, as Slicer's list, as a picture; in JSON with standard deviations; all of one set."""
     true, here = patient
-    capsys.readouterr()
-    assert main(["markers", str(here / "ct.nii.gz"), "--out", str(tmp_path), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["space"] == "LPS" and [one["name"] for one in found["markers"]] == ["M1", "M2", "M3", "M4", "M5"]
+    code, found = run("markers", here / "ct.nii.gz", "--out", tmp_path)
+    assert (code, found["space"]) == (0, "LPS") and [one["name"] for one in found["markers"]] == [
+        "M1",
+        "M2",
+        "M3",
+        "M4",
+        "M5",
+    ]
     position = np.array([one["position_mm"] for one in found["markers"]])
     sd = np.array([one["sd_mm"] for one in found["markers"]])
     nearest = np.linalg.norm(position[:, None] - true, axis=2).argmin(axis=1)
@@ -51,16 +55,14 @@ def test_markers_are_written_for_case_and_slicer(patient, tmp_path, capsys):
     assert {"markers_ct.csv", "markers_ct.mrk.json", "markers.png", "markers.json"} <= set(listed)
 
 
-def test_a_layout_names_them(patient, tmp_path, capsys):
+def test_a_layout_names_them(patient, tmp_path, run):
     """Of any frame: here turned by 90 degrees."""
     true, here = patient
     turned = true[::-1] @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + 30.0
     write_points(tmp_path / "layout.csv", NamedPoints(tuple("PQRST"), turned, None))
-    arguments = ["markers", str(here), "--layout", str(tmp_path / "layout.csv"), "--out", str(tmp_path / "out")]
-    capsys.readouterr()
-    assert main([*arguments, "--json"]) == 0
-    named = {one["name"]: one["position_mm"] for one in json.loads(capsys.readouterr().out)["markers"]}
-    assert np.allclose([named[name] for name in "PQRST"], true[::-1], atol=0.3)
+    code, found = run("markers", here, "--layout", tmp_path / "layout.csv", "--out", tmp_path / "out")
+    named = {one["name"]: one["position_mm"] for one in found["markers"]}
+    assert code == 0 and np.allclose([named[name] for name in "PQRST"], true[::-1], atol=0.3)
 
 
 @pytest.mark.parametrize("options", [("--count", "6"), ("--count", "4"), ("--diameter", "14")])
@@ -109,12 +111,11 @@ def test_init_lists_the_markers_of_a_ct_and_proposes_a_registration(patient, tmp
     assert (here / "markers_ct.csv").read_bytes() == before
 
 
-def test_places_are_proposed(tmp_path, capsys):
+def test_places_are_proposed(tmp_path, run):
     """Of a case with its arm: a list under another name than that of markers that are there."""
     case = coarse_carton(tmp_path / "carton", 30.0)
-    capsys.readouterr()
-    assert main(["markers", str(case), "--propose", "4", "--out", str(tmp_path / "out"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    code, found = run("markers", case, "--propose", 4, "--out", tmp_path / "out")
+    assert code == 0
     points = read_points(tmp_path / "out" / "markers_proposed.csv")
     assert points.names == tuple(one["name"] for one in found["proposed"])
     assert np.allclose(points.points, [one["position_mm"] for one in found["proposed"]])

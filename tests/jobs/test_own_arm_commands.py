@@ -1,7 +1,6 @@
 """Commands on a case with an arm and a tool of one's own, from the outside: what each gives, and what each refuses."""
 
 import csv
-import json
 import re
 
 import numpy as np
@@ -11,7 +10,6 @@ from own_arms import write_holder, write_own_arm
 from refusals import refused_command
 
 from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.run_twin import main
 
 T_BASE_CT = pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.0, -450.0, 0.0]))
 """The bed beside the arm, which stands at the patient's right."""
@@ -62,24 +60,28 @@ def folder(tmp_path_factory):
     return own_case(tmp_path_factory.mktemp("own") / "case")
 
 
-def answer(capfd, *words):
-    """What a command prints as JSON; it must end well."""
-    code = main([*map(str, words), "--json"])
-    told = capfd.readouterr()
-    assert code == 0, told.err
-    return json.loads(told.out)
+@pytest.fixture
+def answer(run):
+    """A function: what a command prints as JSON; it must end well."""
+
+    def told(*words):
+        code, found = run(*words)
+        assert code == 0, found
+        return found
+
+    return told
 
 
-def test_register_counts_the_errors_of_that_arm(folder, capfd):
+def test_register_counts_the_errors_of_that_arm(folder, answer):
     """Markers without error have no residuals; the arm's own errors are sources of the expected one."""
-    told = answer(capfd, "register", folder)
+    told = answer("register", folder)
     assert max(told["residual_mm"].values() if isinstance(told["residual_mm"], dict) else told["residual_mm"]) < 0.01
     assert 0.1 < told["expected_tre_target_mm"] < 5.0
 
 
-def test_the_markers_are_touched(folder, tmp_path, capfd):
+def test_the_markers_are_touched(folder, tmp_path, answer):
     """All four, within the errors that are declared; the list is one that a case takes."""
-    answer(capfd, "touch", folder, "--out", tmp_path)
+    answer("touch", folder, "--out", tmp_path)
     with (tmp_path / "touch.csv").open(encoding="utf-8") as file:
         rows = {row["name"]: [float(row[f"{axis}_mm"]) for axis in "xyz"] for row in csv.DictReader(file)}
     assert sorted(rows) == list("ABCD")
@@ -90,14 +92,14 @@ def test_the_markers_are_touched(folder, tmp_path, capfd):
     assert max(off) < 3.0  # tip and drift of this truth, each half a millimetre on average
 
 
-def test_the_needle_turns_about_the_target(folder, tmp_path, capfd):
-    told = answer(capfd, "rehearse", folder, "--sweep", "--out", tmp_path)
+def test_the_needle_turns_about_the_target(folder, tmp_path, answer):
+    told = answer("rehearse", folder, "--sweep", "--out", tmp_path)
     assert (tmp_path / "sweep.json").is_file() and not told["contacts"] and told["off_point_max_mm"] < 0.1
     assert told["reached_deg"] == pytest.approx(told["wanted_deg"])
 
 
-def test_slicer_gets_the_robots_place(folder, tmp_path, capfd):
-    answer(capfd, "export", folder, "--format", "slicer", "--out", tmp_path)
+def test_slicer_gets_the_robots_place(folder, tmp_path, answer):
+    answer("export", folder, "--format", "slicer", "--out", tmp_path)
     numbers = re.search(r"\nParameters: (.+)", (tmp_path / "ct_to_robot.tfm").read_text()).group(1).split()
     expected = np.linalg.inv(T_BASE_CT)
     assert [float(one) for one in numbers] == pytest.approx([*expected[:3, :3].ravel(), *expected[:3, 3]], abs=0.01)

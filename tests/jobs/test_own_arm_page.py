@@ -28,7 +28,7 @@ def folder(tmp_path_factory):
     (block,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     assert set(tomllib.loads(block)) == {"robot", "tool"}
     parts = (SKIN, structure("organ", "target"), structure("rib", "avoid", margin_mm=3.0))
-    write_case(case, text=case_text(*parts, needle=NEEDLE, search="theta_deg = [0, 20]\nstep_deg = 10.0") + block)
+    write_case(case, text=case_text(*parts, needle=NEEDLE, search="theta_deg = [0, 10]\nstep_deg = 10.0") + block)
     write_own_arm(case / "arm")
     write_holder(case / "holder.stl")
     return top

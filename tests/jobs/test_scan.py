@@ -75,7 +75,7 @@ def of_wood(folder):
     return case
 
 
-def test_a_needle_is_read_in_a_control_ct(tmp_path, capsys):
+def test_a_needle_is_read_in_a_control_ct(tmp_path, run):
     """The tip that `scan` reads is where the rehearsal left it, and so are its errors along and across."""
     forward = np.array([0.2, -0.6, -0.75])
     forward /= np.linalg.norm(forward)
@@ -83,9 +83,10 @@ def test_a_needle_is_read_in_a_control_ct(tmp_path, capsys):
     tip = target + [0.5, 1.0, 2.0]
     end = {"tip_ct_mm": tip.tolist(), "direction_ct": forward.tolist(), "target_ct_mm": target.tolist()}
     (tmp_path / "rehearsal.json").write_text(json.dumps({"needle_end": end}))
-    words = ["--spacing", "2", "--pixel", "1", "--rehearsal", str(tmp_path / "rehearsal.json"), "--json"]
-    assert main(["scan", str(of_wood(tmp_path)), "--out", str(tmp_path / "ct"), *words]) == 0
-    needle = json.loads(capsys.readouterr().out)["needle"]
+    words = ["--spacing", 2, "--pixel", 1, "--rehearsal", tmp_path / "rehearsal.json"]
+    code, found = run("scan", of_wood(tmp_path), "--out", tmp_path / "ct", *words)
+    needle = found["needle"]
+    assert code == 0
     assert needle["true"]["tip_to_target_mm"] == pytest.approx(np.linalg.norm(tip - target))
     assert needle["true"]["depth_mm"] == pytest.approx((tip - target) @ forward)
     assert needle["found"]["tip_to_target_mm"] == pytest.approx(needle["true"]["tip_to_target_mm"], abs=0.5)

@@ -34,6 +34,7 @@ SCENES = {
 }
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", SCENES)
 def test_what_is_safe_in_a_scan_passes_no_arm_and_no_table(name, tmp_path):
     """Nor a structure's margin, within a voxel's diagonal; what knows of nothing beside the patient does pass them."""

@@ -1,11 +1,9 @@
 """The loop: a case of meshes is scanned, `init` makes a case of it, and `search` gives the verdicts of the meshes."""
 
-import json
-
 import numpy as np
 import pytest
 import trimesh
-from case_world import whole
+from case_world import case_text, structure
 
 from puncture_twin.planning.case.entry import grid
 from puncture_twin.planning.search.context import prepare
@@ -13,31 +11,18 @@ from puncture_twin.planning.search.search import search
 from puncture_twin.run_twin import main
 
 PIXEL, STEP_DEG = 2.0, 9.0
-NEEDLE = "[needle]\nlength_mm = 150.0\nshaft_mm = 120.0\ndiameter_mm = 1.2\n"
-CASE = """schema = 2
-region = "other"
-name = "small"
-space = "LPS"
-[target]
-position_mm = [-10.0, 5.0, 4.0]
-structure = "lesion"
-""" + NEEDLE + """[search]
-theta_deg = [0, 90]
-step_deg = 9.0
-[[obstacle]]
-name = "table"
-frame = "ct"
-center_mm = [0.0, 82.0, 0.0]
-size_mm = [240.0, 30.0, 400.0]
-"""  # fmt: skip
+TARGET = 'position_mm = [-10.0, 5.0, 4.0]\nstructure = "lesion"'
+NEEDLE = "length_mm = 150.0\nshaft_mm = 120.0\ndiameter_mm = 1.2"
+TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 82.0, 0.0]\nsize_mm = [240.0, 30.0, 400.0]\n'
 ROLES = {
-    "skin": 'role = "skin"',
-    "liver": 'role = "traverse"',
-    "lesion": 'role = "target"',
-    "aorta": 'role = "avoid"\nmargin_mm = 5.0',
-    "spine": 'role = "avoid"\nmargin_mm = 2.0\nhu = 60.0',
-    "rib_left_7": 'role = "avoid"\nmargin_mm = 1.0\nhu = 60.0',
-    "colon": 'role = "avoid"\nmargin_mm = 3.0',
+    "skin": ("skin", {}),
+    "liver": ("traverse", {}),
+    "lesion": ("target", {}),
+    "aorta": ("avoid", {"margin_mm": 5.0}),
+    "spine": ("avoid", {"margin_mm": 2.0, "hu": 60.0}),
+    "rib_left_7": ("avoid", {"margin_mm": 1.0, "hu": 60.0}),
+    "colon": ("avoid", {"margin_mm": 3.0}),
+    "ganglion": ("avoid", {"margin_mm": 9.0}),
 }
 
 
@@ -60,16 +45,22 @@ def meshes():
     }
 
 
+def written(folder, parts):
+    """The case of these meshes, prepared, and its verdicts."""
+    sections = [TABLE]
+    for name, mesh in parts.items():
+        mesh.export(folder / f"{name}.ply")
+        role, keys = ROLES[name]
+        sections.append(structure(name, role, {"mesh": f"{name}.ply", "unit": "mm"}, **keys))
+    text = case_text(*sections, target=TARGET, needle=NEEDLE, search="theta_deg = [0, 90]\nstep_deg = 9.0")
+    (folder / "case.toml").write_text(text)
+    context = prepare(folder, arm=False)
+    return context, answers(context, context.case.T_ct_entry[:3, :3])
+
+
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("small")
-    text = CASE
-    for name, mesh in meshes().items():
-        mesh.export(folder / f"{name}.ply")
-        text += f'[[structure]]\nname = "{name}"\nmesh = "{name}.ply"\nunit = "mm"\n{ROLES[name]}\n'
-    (folder / "case.toml").write_text(whole(text))
-    context = prepare(folder, arm=False)
-    return folder, context, answers(context, context.case.T_ct_entry[:3, :3])
+    return written(tmp_path_factory.mktemp("small"), meshes())
 
 
 def answers(context, R):
@@ -77,12 +68,21 @@ def answers(context, R):
     return search(context.case, context.anatomy, context.engine, directions)
 
 
-def started(out, report):
-    target = ",".join(str(round(one, 3)) for one in report["target_mm"])
-    assert main(["init", str(out), "--ct", "dicom", f"--target={target}"]) == 0
-    text = (out / "case.toml").read_text()
-    (out / "case.toml").write_text(text[: text.index("[needle]")] + NEEDLE + text[text.index("[search]") :])
-    return prepare(out, arm=False)
+@pytest.fixture
+def scanned(run, undrawn, tmp_path):
+    """A function: what `scan` reports of a case, and the case that `init` makes of the files, with the same needle."""
+
+    def scan(context, *flags):
+        out = tmp_path / "ct"
+        code, report = run("scan", context.case.path, "--out", out, *flags)
+        target = ",".join(str(round(one, 3)) for one in report["target_mm"])
+        assert code == 0 and main(["init", str(out), "--ct", "dicom", f"--target={target}"]) == 0
+        text = (out / "case.toml").read_text()
+        before, after = text[: text.index("[needle]")], text[text.index("[search]") :]
+        (out / "case.toml").write_text(f"{before}[needle]\n{NEEDLE}\n{after}")
+        return report, prepare(out, arm=False)
+
+    return scan
 
 
 def least_slack(context, found):
@@ -99,20 +99,15 @@ def clearances(context, found):
 
 
 @pytest.mark.parametrize(("spacing", "turn", "noise"), [("5", 0, "20"), ("2.5", 35, "40")])
-def test_a_scanned_case_has_the_verdicts_of_its_meshes(truth, tmp_path, capsys, spacing, turn, noise):
+def test_a_scanned_case_has_the_verdicts_of_its_meshes(truth, scanned, spacing, turn, noise):
     """Whatever has a voxel's diagonal to spare keeps its verdict, and no safe direction is wrong by more than that."""
-    folder, context, wanted = truth
-    out = tmp_path / "ct"
-    flags = ["--spacing", spacing, "--pixel", str(PIXEL), "--turn", str(turn), "--noise", noise, "--json"]
-    assert main(["scan", str(folder), "--out", str(out), *flags]) == 0
-    report = json.loads(capsys.readouterr().out)
-    T = np.array(report["T_scan_case"])
-    scanned = started(out, report)
-    found = answers(scanned, T[:3, :3] @ context.case.T_ct_entry[:3, :3])
-    margins = ({one.name: one.margin_mm for one in of.anatomy.structures} for of in (scanned, context))
+    context, wanted = truth
+    report, again = scanned(context, "--spacing", spacing, "--pixel", PIXEL, "--turn", turn, "--noise", noise)
+    found = answers(again, np.array(report["T_scan_case"])[:3, :3] @ context.case.T_ct_entry[:3, :3])
+    margins = ({one.name: one.margin_mm for one in of.anatomy.structures} for of in (again, context))
     assert next(margins) == next(margins)
     voxel = np.linalg.norm([PIXEL, PIXEL, float(spacing)])
-    apart = clearances(scanned, found) - clearances(context, wanted)
+    apart = clearances(again, found) - clearances(context, wanted)
     assert np.abs(apart).max() < voxel
     slack = least_slack(context, wanted)
     assert not np.any(found.safe & ~wanted.safe & (slack < -voxel))
@@ -123,10 +118,7 @@ def test_a_scanned_case_has_the_verdicts_of_its_meshes(truth, tmp_path, capsys, 
     assert (~wanted.safe & ~found.safe).sum() > 60
 
 
-THIN = {"colon": 'role = "avoid"\nmargin_mm = 3.0', "ganglion": 'role = "avoid"\nmargin_mm = 9.0'}
-
-
-def test_what_is_thinner_than_a_voxel_is_not_lost(tmp_path, capsys):
+def test_what_is_thinner_than_a_voxel_is_not_lost(scanned, tmp_path):
     """A sheet of 0.3 mm and a ball of 1 mm before the target: none is safe that breaks a margin by a voxel."""
     sheet = trimesh.creation.box([50.0, 0.3, 50.0])
     sheet.apply_transform(trimesh.transformations.rotation_matrix(0.4, [1.0, 0.3, -0.2]))
@@ -134,26 +126,15 @@ def test_what_is_thinner_than_a_voxel_is_not_lost(tmp_path, capsys):
     speck = trimesh.creation.icosphere(2, 0.5)
     speck.apply_translation([11.3, -24.2, 22.1])
     parts = {name: mesh for name, mesh in meshes().items() if name in ("skin", "lesion", "spine")}
-    text = CASE
-    for name, mesh in {**parts, "colon": sheet, "ganglion": speck}.items():
-        mesh.export(tmp_path / f"{name}.ply")
-        role = THIN.get(name) or ROLES[name]
-        text += f'[[structure]]\nname = "{name}"\nmesh = "{name}.ply"\nunit = "mm"\n{role}\n'
-    (tmp_path / "case.toml").write_text(whole(text))
-    context = prepare(tmp_path, arm=False)
-    wanted = answers(context, context.case.T_ct_entry[:3, :3])
-    out = tmp_path / "ct"
-    assert main(["scan", str(tmp_path), "--out", str(out), "--spacing", "2.5", "--pixel", "1.5", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    context, wanted = written(tmp_path, {**parts, "colon": sheet, "ganglion": speck})
+    report, again = scanned(context, "--spacing", 2.5, "--pixel", 1.5)
     assert report["thin_voxels"]["colon"] > 50 and report["thin_voxels"]["ganglion"] >= 1
-    scanned = started(out, report)
-    found = answers(scanned, context.case.T_ct_entry[:3, :3])
-    names = [one.name for one in scanned.anatomy.structures]
-    margin = {one.name: one.margin_mm for one in scanned.anatomy.structures}
+    found = answers(again, context.case.T_ct_entry[:3, :3])
+    margin = {one.name: one.margin_mm for one in again.anatomy.structures}
     voxel = np.linalg.norm([1.5, 1.5, 2.5])
-    for name in THIN:
+    for name in ("colon", "ganglion"):
         column = [one.name for one in context.anatomy.structures].index(name)
         lack = margin[name] - wanted.clearance.by_structure[:, column]
-        assert name in names and lack.max() > voxel
+        assert lack.max() > voxel
         assert not np.any(found.safe & (lack > voxel))
     assert found.safe.sum() > 50

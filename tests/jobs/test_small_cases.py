@@ -19,7 +19,10 @@ from puncture_twin.run_twin import main
 
 CASES = DATA.parent / "cases"
 MAKER = CASES / "make_cases.py"
-pytestmark = pytest.mark.skipif(not MAKER.is_file(), reason="the small cases are not on this machine")
+pytestmark = [
+    pytest.mark.skipif(not MAKER.is_file(), reason="the small cases are not on this machine"),
+    pytest.mark.usefixtures("undrawn"),
+]
 
 T1 = "70,10,10"
 T2 = "25,25,-40"
@@ -71,7 +74,6 @@ def made(tmp_path_factory):
 
 
 def init(folder, target):
-    """The command `init` on a folder."""
     return ["init", str(folder), "--space", "RAS", "--force", "--target", target, "--hit-radius", "5"]
 
 
@@ -108,12 +110,11 @@ def test_what_a_device_cannot_read_is_refused(made, capsys):
     assert capsys.readouterr().err.count("?") >= 2
 
 
-def test_a_scale_between_two_lists_is_named(made, capsys):
+def test_a_scale_between_two_lists_is_named(made, run):
     """1.6 %, which noise does not explain."""
     folder = made("scale_1.6_percent")
-    lists = [str(folder / name) for name in ("markers_ct.csv", "markers_base.csv")]
-    assert main(["register", *lists, "--target", "0,0,0", "--json"]) == 0
-    assert "1.016" in json.dumps(json.loads(capsys.readouterr().out)["flags"])
+    code, found = run("register", folder / "markers_ct.csv", folder / "markers_base.csv", "--target", "0,0,0")
+    assert code == 0 and "1.016" in json.dumps(found["flags"])
 
 
 @pytest.mark.parametrize("name", ["lab_cylinder", "lab_box_table", "lab_trunk", "lab_trunk_table"])

@@ -137,14 +137,6 @@ def test_failing_is_worse_than_erring(plan, tmp_path):
     assert "ct: worse" in (tmp_path / "ways.html").read_text()
 
 
-@pytest.mark.parametrize("options", [["--guidance", "us"], ["--guidance", "ct,us"], []])
-def test_steps_of_another_way_are_refused_in_one_line(tmp_path, capfd, options):
-    case = ball(tmp_path, errors="touch_mm = 0.2\n")
-    command = ["rehearse", case, *options, "--seeds", 10, "--steps", 3, "--out", tmp_path / "out"]
-    refused_command(command, capfd, "conflicting_options", "--steps")
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_plan_is_rehearsed_in_steps(plan):
     """Error, passes, dose and minutes beside the open loop, in the object and in the table of page and terminal."""
     found = in_rooms(*plan, room_count(50, 0, "ct", 2)).summary()
@@ -156,18 +148,22 @@ def test_a_plan_is_rehearsed_in_steps(plan):
     assert shown["control scans, and their dose, mSv"] == "2.00: 1.80"
 
 
+TEN, STEPS = ["--seeds", 10], ["--seeds", 10, "--steps", 3]
+
+
 @pytest.mark.parametrize(
-    ("guidance", "seeds", "code", "named"),
+    ("guidance", "options", "code", "named"),
     [
-        ("ct,by hand", 10, "unknown_guidance", "by hand"),
-        ("ct,us,ct", 10, "stated_twice", "'ct'"),
-        ("ct,", 10, "unknown_guidance", "''"),
-        ("ct,us", None, "conflicting_options", "--seeds"),
+        (["--guidance", "ct,by hand"], TEN, "unknown_guidance", "by hand"),
+        (["--guidance", "ct,us,ct"], TEN, "stated_twice", "'ct'"),
+        (["--guidance", "ct,"], TEN, "unknown_guidance", "''"),
+        (["--guidance", "ct,us"], [], "conflicting_options", "--seeds"),
+        (["--guidance", "us"], STEPS, "conflicting_options", "--steps"),
+        (["--guidance", "ct,us"], STEPS, "conflicting_options", "--steps"),
+        ([], STEPS, "conflicting_options", "--steps"),
     ],
 )
-def test_a_list_is_refused_in_one_line(tmp_path, capfd, guidance, seeds, code, named):
+def test_a_list_or_steps_of_another_way_are_refused_in_one_line(tmp_path, capfd, guidance, options, code, named):
     case = ball(tmp_path, errors="touch_mm = 0.2\n")
-    counted = [] if seeds is None else ["--seeds", seeds]
-    command = ["rehearse", case, "--guidance", guidance, *counted, "--out", tmp_path / "out"]
-    refused_command(command, capfd, code, named)
+    refused_command(["rehearse", case, *guidance, *options, "--out", tmp_path / "out"], capfd, code, named)
     assert not (tmp_path / "out").exists()

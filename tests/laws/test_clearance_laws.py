@@ -20,7 +20,6 @@ ENGINES = [FastEngine, FclEngine, PlainEngine]
 
 @pytest.fixture(params=ENGINES, ids=lambda kind: kind.__name__)
 def engine(request):
-    """Every implementation in turn."""
     return request.param
 
 

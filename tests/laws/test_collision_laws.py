@@ -68,7 +68,6 @@ def contacts(checker, states, may=False):
 
 
 def free(checker, states, may=False):
-    """Which states touch nothing."""
     return np.array([contact is None for contact in contacts(checker, states, may)])
 
 
@@ -108,12 +107,10 @@ def test_far_obstacles_are_irrelevant(build, states, patient):
 
 
 def ball_at(mesh, shift):
-    """A mesh, moved."""
     return TriangleMesh(mesh.vertices + shift, mesh.faces)
 
 
 def joined(one, other):
-    """Two surfaces as one."""
     return TriangleMesh(
         np.concatenate([one.vertices, other.vertices]), np.concatenate([one.faces, other.faces + len(one.vertices)])
     )

@@ -33,7 +33,7 @@ from tests.case_world import write_case
 def candidates(*, step_deg=2.0, **ranges):
     case = world.make_case()
     found = world.make_candidates(case, step_deg=step_deg, **ranges)
-    return replace(found, grid=world.make_grid(case, step_deg=step_deg, **ranges))
+    return replace(found, grid=world.make_directions(case, step_deg=step_deg, **ranges).grid)
 
 
 def with_safe(found, safe):

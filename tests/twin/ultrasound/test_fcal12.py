@@ -5,8 +5,7 @@ from itertools import product
 import numpy as np
 import places
 import pytest
-from linear_wires import WireFrames, Wires, fit_image, point_to_wire_mm
-from plus_files import read_results, read_wires
+from plus_wires import WireFrames, Wires, fit_image, point_to_wire_mm, read_results, read_wires
 from refusals import refused
 
 DATA = places.DATA / "plus_uscal_fcal12"
