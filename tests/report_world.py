@@ -5,6 +5,7 @@ from pathlib import Path as FilePath
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import trimesh
 from PIL import Image
 
@@ -19,7 +20,8 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, ClearanceColumns, Path, Ranking, Verdict
-from puncture_twin.twin.report.page.page import Shown, write_page
+from puncture_twin.twin.report.map.map_picture import map_figure
+from puncture_twin.twin.report.page import page
 from puncture_twin.twin.report.raster.raster import draw
 from puncture_twin.twin.report.raster.render import Drawn, View
 from puncture_twin.twin.report.slices.panel import Subject
@@ -245,9 +247,8 @@ def make_page(path):
     anatomy.scan = make_scan()
     plan, subject = make_plan(case, candidates), Subject(case, anatomy, candidates.best, REGION)
     regions = np.where(candidates.safe[:, None, None], REGION, np.nan)
-    told = (make_rehearsal(plan), make_registration())
-    shown = Shown(case, anatomy, candidates, plan, *told, film="rehearsal.mp4", subject=subject, regions_ct=regions)
-    write_page(shown, path)
+    parts = (case, anatomy, candidates, plan, make_rehearsal(plan), make_registration())
+    page.write_page(page.Shown(*parts, film="rehearsal.mp4", subject=subject, regions_ct=regions), path)
     return candidates
 
 
@@ -316,6 +317,26 @@ def samples(layer, camera, most=1):
     slant = 1.0 / (rays(camera) @ camera.axes[2]).reshape(size)
     with np.errstate(divide="ignore"):
         return slant / drawn.inverse, drawn.triangle
+
+
+def no_scene(*_):
+    """In the place of `scene_figure`, which takes most of a page's time."""
+    return {}
+
+
+def page_text(folder, *parts, **others):
+    """The page of these parts, without its scene."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "scene_figure", no_scene)
+        page.write_page(page.Shown(*parts, **others), folder / "page.html")
+    return (folder / "page.html").read_text(encoding="utf-8")
+
+
+def map_image(candidates, case):
+    """The map as it is drawn."""
+    file = io.BytesIO()
+    map_figure(candidates, case).savefig(file, format="png")
+    return Image.open(file).convert("RGB")
 
 
 def unpacked_bytes(block):

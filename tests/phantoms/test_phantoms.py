@@ -12,18 +12,9 @@ import trimesh
 from puncture_twin import meshes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from tests.carton_truth import carton_field
-from tools.phantoms import bones, carton
+from tools.phantoms import bones, carton, guidance
 from tools.phantoms.abdomen import STRUCTURES, abdomen_field, abdomen_mesh
 from tools.phantoms.carton import carton_meshes
-from tools.phantoms.guidance import (
-    GUIDANCE_SEED,
-    IN_PLANE_MM,
-    SLICE_SPACING_MM,
-    TOUCH_SIGMA_MM,
-    abdomen_guidance,
-    patient_placement,
-    skin_markers_ct,
-)
 from tools.phantoms.implicit import capsule, ellipsoid, smooth_max
 from tools.phantoms.manifest import ply_bytes
 from tools.phantoms.mesher import SamplingBox, mesh_field
@@ -56,8 +47,8 @@ def rows(path: str) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def inside() -> dict[str, np.ndarray]:
-    """Which nodes of a 14 mm grid over the trunk lie in which structure."""
-    axes = [np.arange(low, high, 14.0) for low, high in ((-170, 171), (-118, 119), (-195, 262))]
+    """Which nodes of an 18 mm grid over the trunk lie in which structure."""
+    axes = [np.arange(low, high, 18.0) for low, high in ((-170, 171), (-118, 119), (-195, 262))]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return {name: abdomen_field(name)(nodes) < 0 for name in STRUCTURES}
 
@@ -165,14 +156,14 @@ def test_aorta_is_as_wide_as_an_adults():
 
 def test_markers_lie_on_the_skin_and_far_apart():
     """Six markers, on the skin to 1e-9 mm, at least 60 mm from each other."""
-    points = np.stack(list(skin_markers_ct().values()))
+    points = np.stack(list(guidance.skin_markers_ct().values()))
     assert points.shape == (6, 3) and np.abs(abdomen_field("skin")(points)).max() < 1e-9
     assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 60.0
 
 
 def test_placement_is_a_rigid_motion_with_the_arm_clear_of_the_patient():
     """Proper rotation; a 150 mm wide base, and its axis, stay outside the skin by 150 mm or more."""
-    T_base_ct = patient_placement()
+    T_base_ct = guidance.patient_placement()
     R = T_base_ct[:3, :3]
     assert np.allclose(R @ R.T, np.eye(3), atol=1e-12) and np.linalg.det(R) == pytest.approx(1.0, abs=1e-12)
     skin_base = vertices("skin") @ R.T + T_base_ct[:3, 3]
@@ -182,18 +173,21 @@ def test_placement_is_a_rigid_motion_with_the_arm_clear_of_the_patient():
 
 def test_point_lists_are_the_simulated_ones_and_keep_their_bounds():
     """The committed lists come from the stated seed; reading errs within half the resolution, touch by the noise."""
-    known = abdomen_guidance(np.random.default_rng(GUIDANCE_SEED))
+    known = guidance.abdomen_guidance(np.random.default_rng(guidance.GUIDANCE_SEED))
     read, touched, truth = (rows(f"abdomen/{name}.csv") for name in ("markers_ct", "touch", "truth"))
     assert list(read) == list(touched) == ["M1", "M2", "M3", "M4", "M5", "M6"]
     assert list(truth) == [*read, "target"]
-    T_base_ct = patient_placement()
-    exact = {**skin_markers_ct(), "target": LESION_CENTRE_LPS_MM}
+    T_base_ct = guidance.patient_placement()
+    exact = {**guidance.skin_markers_ct(), "target": LESION_CENTRE_LPS_MM}
     for name, point in truth.items():
         assert np.abs(T_base_ct[:3, :3] @ exact[name] + T_base_ct[:3, 3] - point).max() < 1e-6
     for name, point in read.items():
         assert np.abs(point - known.markers_ct[name]).max() < 1e-3
-        assert np.all(np.abs(point - exact[name]) < np.array([IN_PLANE_MM, IN_PLANE_MM, SLICE_SPACING_MM]) / 2 + 1e-3)
-        assert np.linalg.norm(touched[name] - truth[name]) < 5 * TOUCH_SIGMA_MM
+        assert np.all(
+            np.abs(point - exact[name])
+            < np.array([guidance.IN_PLANE_MM, guidance.IN_PLANE_MM, guidance.SLICE_SPACING_MM]) / 2 + 1e-3
+        )
+        assert np.linalg.norm(touched[name] - truth[name]) < 5 * guidance.TOUCH_SIGMA_MM
     assert max(np.linalg.norm(read[name] - exact[name]) for name in read) > 0.2
 
 

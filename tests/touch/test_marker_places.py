@@ -29,7 +29,7 @@ from puncture_twin.twin.plant.scanner.image import box
 
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory):
-    context = prepare(coarse_carton(tmp_path_factory.mktemp("places") / "carton", 20.0))
+    context = replace(prepare(coarse_carton(tmp_path_factory.mktemp("places") / "carton", 20.0)), chance=None)
     candidates = context.search()
     return context, candidates, {count: propose_markers(context, candidates, count) for count in (3, 5)}
 

@@ -29,7 +29,7 @@ def scanned(solids, spacing, shift=(0.0, 0.0, 0.0), seed=0, size=(66.0, 40.0, 11
     return Volume(image.hu, T, Path("scan")), image
 
 
-def marked(spacing, kind="disc", draws=4):
+def marked(spacing, kind="disc", draws=3):
     """Errors (n, 3) of both readings, of markers on the front that lie evenly over a cell along the bed."""
     fine, rule = [], []
     for draw in range(draws):

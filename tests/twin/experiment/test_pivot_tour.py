@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, flange_pose
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.progress import uncounted
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.touch.touch_planner import plan_pivot, spread_poses
@@ -23,10 +24,6 @@ from puncture_twin.twin.plant.true_needle import draw_pivot_truth
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"
 
 
-def quiet(*_):
-    """Shows no progress."""
-
-
 @pytest.fixture(scope="module")
 def context():
     return prepare(CASE)
@@ -34,7 +31,7 @@ def context():
 
 @pytest.fixture(scope="module")
 def tour(context):
-    return plan_pivot(context, 8, place_base=None, seed=0, progress=quiet)
+    return plan_pivot(context, 8, place_base=None, seed=0, progress=uncounted)
 
 
 def test_every_pose_has_the_tip_on_the_place(tour):
@@ -62,7 +59,7 @@ def test_the_poses_taken_tell_the_tip_nearly_as_well_as_any():
 def test_a_place_that_cannot_be_touched_is_refused(context):
     """Far beyond the arm's reach."""
     with refused("too_few_poses", by=NoAnswerError):
-        plan_pivot(context, 6, place_base=np.array([3000.0, 0.0, 0.0]), seed=0, progress=quiet)
+        plan_pivot(context, 6, place_base=np.array([3000.0, 0.0, 0.0]), seed=0, progress=uncounted)
 
 
 def drawn(context, tour, errors, seed):
@@ -77,14 +74,11 @@ def drawn(context, tour, errors, seed):
 
 @pytest.mark.parametrize(("link_mm", "joint_deg"), [(0.05, 0.005), (0.5, 0.05)])
 def test_errors_and_residuals_are_those_declared(context, tour, link_mm, joint_deg):
-    """Over 150 arms, calibrated or not: squared errors of the tip are those of its covariance, residuals likewise.
-
-    Their mean is known to 9 % where one axis errs most; twice that is allowed.
-    """
+    """Squared errors of the tip are those of its covariance, residuals likewise: known to 11 % where one axis errs."""
     off = np.radians(joint_deg)
     arm = dataclasses.replace(context.case.errors.arm, link_mm=link_mm, joint=off, twist=off)
     errors = dataclasses.replace(context.case.errors, arm=arm)
-    found = [drawn(context, tour, errors, seed) for seed in range(150)]
+    found = [drawn(context, tour, errors, seed) for seed in range(100)]
     squared = np.mean([np.sum((pivot.tip_flange - tip) ** 2) for pivot, tip in found])
     assert squared == pytest.approx(np.mean([np.trace(pivot.cov_tip) for pivot, _ in found]), rel=0.2)
     residual = np.mean([pivot.residual_mm**2 for pivot, _ in found])
@@ -104,10 +98,10 @@ def test_the_twin_finds_the_tip_of_its_arm(context, tmp_path, monkeypatch):
         return dataclasses.replace(truth, eta=eta, aim_ct=dict.fromkeys(names, place[:3]), arrival=still)
 
     monkeypatch.setattr(true_needle, "draw_pivot_truth", without_noise)
-    run = pivot_tour(context, tmp_path, 5, None, 0)
+    run = pivot_tour(context, tmp_path, 4, None, 0)
     np.testing.assert_allclose(run.found.pivot.tip_flange, off + [0.0, 0.0, 401.0], atol=0.06)
     assert run.found.pivot.residual_mm < 0.05
-    assert "5 poses touched about" in pivot_tour_text(run)
+    assert "4 poses touched about" in pivot_tour_text(run)
     again = pivot_case(context.case, tmp_path / "pivot.csv")
     np.testing.assert_allclose(again.pivot.tip_flange, run.found.pivot.tip_flange, atol=1e-6)
     assert json.loads((tmp_path / "pivot.json").read_text())["tip_error_mm"] == pytest.approx(run.error_mm)

@@ -29,7 +29,8 @@ from puncture_twin.twin.rehearsal.distribution import rehearse_trials
 from puncture_twin.twin.rehearsal.guided_trials import guided_trials
 from puncture_twin.twin.rehearsal.trials import draw_truths
 
-ROOMS = 5000
+ROOMS = 3000
+"""Their rms is known to 1 %, their fraction in a region of 95 % to .4 %: a third of what is allowed."""
 DEVICES = "[motion]\ntarget_sd_mm = [0.4, 0.4, 1.0]\n[stereo]\n[ultrasound]\n"
 BREATH = '[breathing]\namplitude_mm = 4.0\ndirection = [0.0, 0.6, 0.8]\ngate = 0.3\nweights = { "*" = 0.5 }\n'
 
@@ -59,7 +60,7 @@ def prepared(folder, tables, touch_mm=0.2, length_mm=210.0, nearest=False, bevel
     bevelled = [("length_mm = 210.0", "bevel_deg = 0.0\nlength_mm = 210.0")] if bevel else []
     file.write_text(changed(file.read_text(), stated, *bevelled))
     context = pt.prepare(file)
-    found = context.search()
+    found = replace(context, chance=None).search()
     rows = np.flatnonzero(found.safe)
     wide = [corridor_mm(context.case, context.chance, found.outward_ct[row]) for row in rows]
     row = rows[np.argmin(wide) if nearest else np.argmax(wide)]
@@ -82,7 +83,7 @@ def test_every_way_errs_as_predicted(insertion, way):
     """Predicted over realised, the 95 % region, and the chance to be within radii, from rooms with nonlinear arms."""
     found = rehearse_trials(*insertion, ROOMS, 3, way)
     assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03)
-    assert found.in_region.mean() == pytest.approx(0.95, abs=0.0105)  # 0.94 to 0.96, the draws' own error beside it
+    assert found.in_region.mean() == pytest.approx(0.95, abs=0.0105)
     radii = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0)
     off = [abs(hit_in_ball(found.cov_ct[None], mm)[0] - (found.tip_error_mm < mm).mean()) for mm in radii]
     assert np.mean(off) <= 0.01

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose, link_poses
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.progress import uncounted
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.collision.workcell import home_configuration
@@ -43,10 +44,6 @@ from puncture_twin.twin.world.workcell import open_workcell
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"
 SETUP_2 = ROOT / "meshes" / "carton" / "case_m_setup2.toml"
 CHOICE = Choice(angles=(np.radians(18.0), np.radians(232.0)))
-
-
-def quiet(*_):
-    """Shows no progress."""
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +76,7 @@ def exact(context, shift_base=(0.0, 0.0, 0.0)):
 
 def toured(context, plan, truth, prepared=None):
     checkers = approach_checkers(prepared if prepared is not None else context, TOUCHING_PADDING_MM)
-    return execute_touches(plan, context.case, context.anatomy, checkers, truth, quiet)
+    return execute_touches(plan, context.case, context.anatomy, checkers, truth, uncounted)
 
 
 def executed(context, plan, truth):
@@ -216,16 +213,16 @@ def test_a_run_errs_as_its_drawn_twin(context, done):
 
 
 def test_drawn_truths_err_as_the_plan_predicts(context, done):
-    """Their rms is known to 7 % (100 of them, one axis errs most); less than three of those are allowed."""
+    """Their rms is known to 9 % (60 of them, one axis errs most); less than two of those are allowed."""
     run = done[0]
     q, outward = touch_job._puncture(context, CHOICE)
     tour = touch_job.Tour(run.plan, q, outward)
-    errors = [touch_job.drawn_once(context, tour, seed).tip_error_mm for seed in range(100)]
+    errors = [touch_job.drawn_once(context, tour, seed).tip_error_mm for seed in range(60)]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(run.plan.expected_mm, rel=0.17)
 
 
 def test_the_puncture_after_touches_ends_in_the_simulator_where_kinematics_say(context, done):
-    """Planned by the registration of the touches, from home, free of contact, straight to the target; then executed."""
+    """Planned by the registration of the touches, from home, free of contact, straight; executed at twice the speed."""
     run, (q, outward) = done[0], touch_job._puncture(context, CHOICE)
     tour, registration = touch_job.Tour(run.plan, q, outward), run.use.registration
     plan = plan_puncture(context, outward, q, registration)
@@ -234,7 +231,8 @@ def test_the_puncture_after_touches_ends_in_the_simulator_where_kinematics_say(c
     assert [np.degrees(plan.theta), np.degrees(plan.beta)] == pytest.approx([18.0, 232.0])
     np.testing.assert_allclose(plan.approach.q[0], home_configuration(context.case))
     truth, at_target = touch_job.true_touches(context, tour, run.seed), touch_job.true_at_target(context, run.seed)
-    inserted = rehearse_touched(context, plan, truth, at_target)
+    fast = dataclasses.replace(plan, insertion=Trajectory(plan.insertion.times_s / 2, plan.insertion.q))
+    inserted = rehearse_touched(context, fast, truth, at_target)
     assert inserted.tip_error_mm == pytest.approx(run.use.tip_error_mm, abs=0.003)
     assert inserted.contacts == () and inserted.control == "impedance" and inserted.off_path_mm < 0.02
 
@@ -305,7 +303,7 @@ def test_a_box_that_nobody_knew_stops_the_arm(context, first):
 def test_a_case_without_declared_errors_is_refused(context):
     bare = dataclasses.replace(context, case=dataclasses.replace(context.case, errors=None))
     with refused("no_markers"):
-        plan_touches(bare, np.zeros(6), seed=0, progress=quiet)
+        plan_touches(bare, np.zeros(6), seed=0, progress=uncounted)
 
 
 class PaperArm:
@@ -340,7 +338,7 @@ class PaperArm:
 )
 def test_a_tour_needs_nothing_but_what_the_arm_says(context, done, arm, read, failed, seconds):
     """Any arm does that answers the device's words: come, stiff, soft, back at each marker, and home at the end."""
-    found = touch_tour(done[0].plan, arm, approach_checkers(context, TOUCHING_PADDING_MM), quiet)
+    found = touch_tour(done[0].plan, arm, approach_checkers(context, TOUCHING_PADDING_MM), uncounted)
     assert len(found.readings) == read
     assert all(failed in why for why in found.failed.values())
     assert found.seconds == seconds
@@ -353,6 +351,6 @@ def test_a_tour_needs_nothing_but_what_the_arm_says(context, done, arm, read, fa
 def test_an_arm_that_stops_leaves_the_rest_unread(context, done):
     plan = done[0].plan
     arm = PaperArm(stops_at=plan.touches[1].name)
-    found = touch_tour(plan, arm, approach_checkers(context, TOUCHING_PADDING_MM), quiet)
+    found = touch_tour(plan, arm, approach_checkers(context, TOUCHING_PADDING_MM), uncounted)
     assert [one.name for one in found.readings] == [plan.touches[0].name]
     assert set(found.failed.values()) == {"the tour was stopped: forearm touches trolley"}

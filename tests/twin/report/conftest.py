@@ -1,4 +1,4 @@
-"""The small patient of `report_world`, and a browser: one a module."""
+"""The small patient of `report_world`, one a module, and a browser for all of them."""
 
 import pytest
 import report_world as world
@@ -24,7 +24,7 @@ def plan(case, candidates):
     return world.make_plan(case, candidates)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def browser():
     from page_browser import chromium  # here: without playwright its tests alone are skipped
 

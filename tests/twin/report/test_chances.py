@@ -12,10 +12,9 @@ from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, Un
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
 from puncture_twin.twin.report.error_pictures import draw_rooms_picture
-from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import chance_raster, map_raster, touch_nothing
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.page.page import Shown, Uncertainty, methods_text, write_page
+from puncture_twin.twin.report.page.page import Uncertainty, methods_text
 from puncture_twin.twin.report.page.page_data import map_data
 from puncture_twin.twin.report.patient import rooms
 from puncture_twin.twin.report.present import Section, text
@@ -70,11 +69,9 @@ def test_the_layer_shows_what_the_table_holds(shown):
     assert chance_raster(replace(found, chances=None), rows) is None
 
 
-def test_the_map_has_the_layer_only_with_chances(shown, tmp_path):
+def test_the_map_has_the_layer_only_with_chances(shown):
     case, found = shown
-    draw_map(found, case, tmp_path / "with.png")
-    draw_map(replace(found, chances=None), case, tmp_path / "without.png")
-    with_it, without = (np.asarray(Image.open(tmp_path / name)) for name in ("with.png", "without.png"))
+    with_it, without = (np.asarray(world.map_image(one, case)) for one in (found, replace(found, chances=None)))
     assert (with_it != without).any(axis=2).mean() > 0.01
 
 
@@ -83,16 +80,14 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
     case, found = shown
     picture = tmp_path / "rooms.png"
     Image.new("RGB", (4, 4)).save(picture)
-    told, plain = tmp_path / "told.html", tmp_path / "plain.html"
-    anatomy, plan = world.make_anatomy(), world.make_plan(case, found)
-    parts = (case, anatomy, found, plan, None, world.make_registration())
-    write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, ROOMS, picture)), told)
-    write_page(Shown(case, anatomy, replace(found, chances=None), *parts[3:]), plain)
-    text = told.read_text()
+    anatomy, told = world.make_anatomy(), (world.make_plan(case, found), None, world.make_registration())
+    plain = world.page_text(tmp_path, case, anatomy, replace(found, chances=None), *told)
+    uncertainty = Uncertainty(BREAKDOWN, ROOMS, picture)
+    text = world.page_text(tmp_path, case, anatomy, found, *told, uncertainty=uncertainty)
     for words in TOLD:
         assert words in text
     for words in ("How sure it is", "In many trials"):
-        assert words not in plain.read_text()
+        assert words not in plain
     none = replace(found, chances=replace(found.chances, hit=np.full(len(found), np.nan)))
     for one, computed in ((found, True), (none, False), (replace(found, chances=None), False)):
         said = methods_text(case, anatomy, one)
@@ -116,19 +111,17 @@ BUDGET = {
 def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
     """The picture in the page itself, its numbers below, and nothing where there is no budget."""
     case, found = shown
-    told, plain = tmp_path / "told.html", tmp_path / "plain.html"
     parts = (case, world.make_anatomy(), found, world.make_plan(case, found), None, world.make_registration())
-    write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, None, None, BUDGET)), told)
-    write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, None, None)), plain)
-    text = told.read_text()
+    text = world.page_text(tmp_path, *parts, uncertainty=Uncertainty(BREAKDOWN, None, None, BUDGET))
+    plain = world.page_text(tmp_path, *parts, uncertainty=Uncertainty(BREAKDOWN, None, None))
     section = text[text.index('<h2 id="budget">') : text.index('<h2 id="registration">')]
     assert "The next 0.75 mm would be gained by: slices of 1 mm." in section
     assert "data:image/png;base64,iVBOR" in section
     for number in ("1.60", "1.20", "1.25"):
         assert f"{number}</td>" in section
     assert "0.00" not in section.replace(section[section.index("base64,") : section.index('"></figure>')], "")
-    assert 'href="#budget"' in text and "budget" not in plain.read_text().split("<h2")[1]
-    assert 'id="budget"' not in plain.read_text()
+    assert 'href="#budget"' in text and "budget" not in plain.split("<h2")[1]
+    assert 'id="budget"' not in plain
 
 
 def test_rooms_without_any_that_was_reached_say_nothing():

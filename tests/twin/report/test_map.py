@@ -6,22 +6,12 @@ import numpy as np
 import pytest
 import report_world as world
 from matplotlib.text import Text
-from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.twin.report.map.map_picture import draw_map, map_figure
-from puncture_twin.twin.report.map.map_raster import (
-    HATCH,
-    HATCH_AIR,
-    HATCH_NOT_SEARCHED,
-    MOST_DOTS,
-    RINGS_CLEAR,
-    map_raster,
-    ring_labels,
-    row_colours,
-    shown_front,
-)
+from puncture_twin.twin.report.map import map_raster
+from puncture_twin.twin.report.map.map_picture import map_figure
+from puncture_twin.twin.report.map.map_raster import RINGS_CLEAR, ring_labels
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.numbers import reason_counts
 from puncture_twin.twin.report.page.page_data import map_data
@@ -52,17 +42,13 @@ def written(found, case):
     return [text.get_text() for text in map_figure(found, case).findobj(Text)]
 
 
-def test_the_same_map_is_the_same_file(case, candidates, tmp_path):
-    """Sets of files are known by their hashes: no date, and no name of a program that may be a newer one tomorrow."""
-    for name in ("one.png", "two.png"):
-        draw_map(candidates, case, tmp_path / name)
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-    assert Image.open(tmp_path / "one.png").info.keys() <= {"dpi"}
+@pytest.fixture(scope="module")
+def said(case, candidates):
+    return written(candidates, case)
 
 
-def test_where_nobody_looked_is_not_the_skin(case, candidates):
+def test_where_nobody_looked_is_not_the_skin(said):
     """The region says that it is unknown and not seen; the rib beside it is named as it was."""
-    said = written(candidates, case)
     assert "unknown:\nnot seen" in said and "rib right 9" in said and "skin" not in said
 
 
@@ -84,17 +70,16 @@ def test_text_and_page_say_that_it_was_not_seen(case, candidates):
 
 
 @pytest.mark.parametrize(
-    ("clearance", "said"),
+    ("clearance", "legend"),
     [(68.5, "safe, least clearance 68.5 mm everywhere"), (np.inf, "safe, no structure has a margin")],
 )
-def test_one_clearance_is_one_shade_and_no_scale(case, candidates, clearance, said):
+def test_one_clearance_is_one_shade_and_no_scale(case, candidates, said, clearance, legend):
     """No bar from 68.5 to 68.5 mm, and none from 0 to 1 where nothing has a margin."""
     even = with_clearance(candidates, clearance)
-    assert len(np.unique(row_colours(even)[even.safe], axis=0)) == 1
+    assert len(np.unique(map_raster.row_colours(even)[even.safe], axis=0)) == 1
     texts = written(even, case)
-    assert said in texts and not [text for text in texts if text.endswith("by least clearance")]
-    texts = written(candidates, case)
-    assert {"5.0 mm", "11.5 mm", "safe, by least clearance"} <= set(texts)
+    assert legend in texts and not [text for text in texts if text.endswith("by least clearance")]
+    assert {"5.0 mm", "11.5 mm", "safe, by least clearance"} <= set(said)
 
 
 def test_no_mark_stands_on_the_angle_of_a_ring(case, candidates):
@@ -119,22 +104,22 @@ def front_of(found, rows):
 def test_a_large_front_is_thinned_and_says_so(case, candidates):
     """The best-ranked of those that keep apart, everywhere where the front is; a small one is whole."""
     view, safe = map_view(case, candidates), np.flatnonzero(candidates.safe & (candidates.theta > 0.01))
-    many, few = front_of(candidates, safe), front_of(candidates, safe[:MOST_DOTS])
-    shown = shown_front(many, view)
-    assert MOST_DOTS / 3 < len(shown.rows) <= MOST_DOTS
+    many, few = front_of(candidates, safe), front_of(candidates, safe[: map_raster.MOST_DOTS])
+    shown = map_raster.shown_front(many, view)
+    assert map_raster.MOST_DOTS / 3 < len(shown.rows) <= map_raster.MOST_DOTS
     assert shown.text == f"Pareto front ({len(shown.rows)} of {len(safe)})"
     assert shown.rows[0] == safe[np.argmin(candidates.ranking.rank[safe])]
     places, dots = (view.place(candidates.theta[rows], candidates.beta[rows]) for rows in (safe, shown.rows))
     assert np.linalg.norm(places[:, None] - dots, axis=2).min(axis=1).max() < 0.35
-    whole = shown_front(few, view)
-    assert whole.text == "Pareto front" and sorted(whole.rows) == sorted(safe[:MOST_DOTS])
+    whole = map_raster.shown_front(few, view)
+    assert whole.text == "Pareto front" and sorted(whole.rows) == sorted(safe[: map_raster.MOST_DOTS])
 
 
 def test_one_direction_is_one_dot(case, candidates):
     """At θ = 0 every β is the same direction."""
     pole = np.flatnonzero(candidates.safe & (candidates.theta < 1e-9))
-    assert len(pole) > MOST_DOTS
-    shown = shown_front(front_of(candidates, pole), map_view(case, candidates))
+    assert len(pole) > map_raster.MOST_DOTS
+    shown = map_raster.shown_front(front_of(candidates, pole), map_view(case, candidates))
     assert len(shown.rows) == 1 and shown.text == "Pareto front"
 
 
@@ -165,7 +150,7 @@ def test_the_greys_of_what_is_not_known_are_told_apart(case, candidates):
     assert air.any() and body.any() and np.array_equal(air, refused & (np.degrees(found.theta) > 40.0))
     counts = {line.text: line.count for line in reason_counts(found)}
     assert counts[UNSEEN_AIR_TEXT] == air.sum() and counts[REASON_TEXT[Reason.UNKNOWN_REGION]] == body.sum()
-    raster = map_raster(found, map_view(case, found), 400)
+    raster = map_raster.map_raster(found, map_view(case, found), 400)
     middle = np.arange(400) - 199.5
     outside = (raster.rows < 0) & (np.hypot(middle[:, None], middle) < 190.0)
     where = [np.append(rows, False)[raster.rows] for rows in (air, body)] + [outside]
@@ -174,4 +159,4 @@ def test_the_greys_of_what_is_not_known_are_told_apart(case, candidates):
     assert dark[1] + 50 < dark[0] and dark[0] + 30 < dark[2] and all(0.1 < fraction < 0.4 for fraction in lines)
 
 
-LINES = (HATCH_AIR, HATCH, HATCH_NOT_SEARCHED)
+LINES = (map_raster.HATCH_AIR, map_raster.HATCH, map_raster.HATCH_NOT_SEARCHED)

@@ -130,25 +130,26 @@ def map_pixel(image, view, theta_deg, beta_deg):
     return image.getpixel((int(column), int(line)))
 
 
-def test_the_finished_map(case, candidates, tmp_path):
-    draw_map(candidates, case, tmp_path / "map.png")
-    image = Image.open(tmp_path / "map.png").convert("RGB")
-    view = map_view(case, candidates)
+def test_the_finished_map_is_the_same_file_each_time(case, candidates, tmp_path):
+    """Sets of files are known by their hashes: no date, and no name of a program that may be a newer one tomorrow."""
+    first, again = tmp_path / "map.png", tmp_path / "again.png"
+    for path in (first, again):
+        draw_map(candidates, case, path)
+    assert first.read_bytes() == again.read_bytes()
+    assert sorted(tmp_path.iterdir()) == [again, first]
+    assert Image.open(first).info.keys() <= {"dpi"}
+    image, view = Image.open(first).convert("RGB"), map_view(case, candidates)
     assert map_pixel(image, view, 82.0, 200.0) == REASON_COLOURS["too_long"]
     assert map_pixel(image, view, 35.0, 48.0) == REASON_COLOURS["too_close"]
     red, green, blue = map_pixel(image, view, 40.0, 223.0)
     assert green > 1.2 * red and green > blue
-    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
 
 
-def test_a_map_of_nothing_safe_and_of_one_direction(case, tmp_path):
-    draw_map(world.make_candidates(case, safe=False), case, tmp_path / "none.png")
+def test_a_map_of_nothing_safe_and_of_one_direction(case):
+    assert world.map_image(world.make_candidates(case, safe=False), case).width > 300
     one = world.make_candidates(case, theta_deg=(40, 40), beta_deg=(200, 200))
     assert len(one) == 1
-    draw_map(one, case, tmp_path / "one.png")
-    view = map_view(case, one)
-    image = Image.open(tmp_path / "one.png").convert("RGB")
-    assert map_pixel(image, view, 20.0, 200.0) == (255, 255, 255)
+    assert map_pixel(world.map_image(one, case), map_view(case, one), 20.0, 200.0) == (255, 255, 255)
 
 
 def test_counts_and_solid_angles(case, candidates):
@@ -275,9 +276,8 @@ def test_many_structures_share_legend_lines():
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
 def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
     """The encoder is told how many threads it has: it does not take as many as there are cores."""
-    across = np.linspace(0, 255, film.WIDTH)[None, :, None] * np.ones((film.HEIGHT, 1, 3))
-    frames = [np.roll(across, 9 * k, axis=1) + rng.normal(0, 20, across.shape) for k in range(30)]
-    frames = [np.clip(frame, 0, 255).astype(np.uint8) for frame in frames]
+    across = np.linspace(0, 255, film.WIDTH)[None, :, None] + rng.normal(0, 20, (film.HEIGHT, film.WIDTH, 3))
+    frames = [np.roll(np.clip(across, 0, 255).astype(np.uint8), 9 * k, axis=1) for k in range(12)]
     cores = os.sched_getaffinity(0)
     try:
         for count in (1, len(cores)):
@@ -413,6 +413,11 @@ def visible(text):
     return re.sub(r"<(script|style)\b.*?</\1>", "", text, flags=re.DOTALL)
 
 
+def page_of(folder, *parts, **others):
+    """What the page shows of these parts."""
+    return visible(world.page_text(folder, *parts, **others))
+
+
 def test_the_page_holds_the_numbers(report):
     text = visible(report)
     for words in (
@@ -440,8 +445,7 @@ def test_without_markers_the_page_says_what_is_not_known(tmp_path):
     plan.expected_target_error_mm = float("nan")
     rehearsal = world.make_rehearsal(plan)
     rehearsal.predicted_error_mm, rehearsal.truth_is_belief = float("nan"), True
-    write_page(Shown(case, world.make_anatomy(), candidates, plan, rehearsal), tmp_path / "page.html")
-    text = visible((tmp_path / "page.html").read_text(encoding="utf-8"))
+    text = page_of(tmp_path, case, world.make_anatomy(), candidates, plan, rehearsal)
     assert text.count("unknown (no markers)") == 3 and "NaN" not in text
     assert 0 < text.index("The truth equals the belief") < text.index("safe directions")
 
@@ -482,13 +486,10 @@ def test_notes_are_folded_below_the_warnings(candidates, tmp_path):
     The target of a case in RAS stands there as it was typed.
     """
     case = world.make_case(space="RAS")
-    pages = []
-    for number, findings in enumerate(([Finding("far", Severity.NOTE, "a <note>")], [])):
-        anatomy = world.make_anatomy(warnings=("a warning",))
-        anatomy.findings = tuple(findings)
-        write_page(Shown(case, anatomy, candidates), tmp_path / f"{number}.html")
-        pages.append(visible((tmp_path / f"{number}.html").read_text(encoding="utf-8")))
-    with_note, without = pages
+    anatomy = world.make_anatomy(warnings=("a warning",))
+    without = page_of(tmp_path, case, anatomy, candidates)
+    anatomy.findings = (Finding("far", Severity.NOTE, "a <note>"),)
+    with_note = page_of(tmp_path, case, anatomy, candidates)
     assert '<li class="bad">a warning</li>' in with_note and '<li class="bad">a &lt;note' not in with_note
     assert "<details><summary>Notes (1)</summary><ul><li>a &lt;note&gt;</li></ul></details>" in with_note
     assert "<summary>Notes" not in without and "at (-10.0, 20.0, 30.0) mm RAS" in without
@@ -496,8 +497,8 @@ def test_notes_are_folded_below_the_warnings(candidates, tmp_path):
 
 def test_nothing_safe_is_said_first(anatomy, case, tmp_path):
     nothing = world.make_candidates(case, safe=False)
-    write_page(Shown(case, anatomy, nothing), tmp_path / "page.html")
-    text = visible((tmp_path / "page.html").read_text(encoding="utf-8"))
+    text = page_of(tmp_path, case, anatomy, nothing)
+    assert f"{len(nothing):,} directions searched, all rejected" in text
     assert text.index("Nothing is safe") < text.index("Which directions are safe")
     assert "skin angle" in text
     for empty in ("plan", "registration", "rehearsal"):  # neither heading nor a line in the contents
@@ -508,14 +509,14 @@ def test_a_failed_plan_is_none_that_nobody_wanted(anatomy, case, candidates, tmp
     """Page and scene tell them apart: the one is red and says why, the other says which command plans."""
     said = []
     monkeypatch.setattr(scene_picture.annotate, "write", lambda draw, place, text, **look: said.append(text))
-    pages = {}
-    for name, refusal in (("searched", ""), ("failed", "no approach was found to any of 12 candidates")):
-        parts = (case, anatomy, candidates, None)
-        write_page(Shown(*parts, refusal=refusal), tmp_path / f"{name}.html")
-        draw_scene(Shown(*parts, refusal=refusal), tmp_path / f"{name}.png")
-        pages[name] = (tmp_path / f"{name}.html").read_text(encoding="utf-8")
-    assert 'class="card bad"' in pages["failed"] and 'class="card bad"' not in pages["searched"]
-    failed, searched = visible(pages["failed"]), visible(pages["searched"])
+    parts, pages = (case, anatomy, candidates, None), []
+    for box in ("LEFT_BOX", "RIGHT_BOX"):
+        monkeypatch.setattr(scene_picture, box, (16, 84, 216, 284))
+    for refusal in ("", "no approach was found to any of 12 candidates"):
+        pages.append(page_of(tmp_path, *parts, refusal=refusal))
+        draw_scene(Shown(*parts, refusal=refusal), tmp_path / "scene.png")
+    searched, failed = pages
+    assert 'class="card bad"' in failed and 'class="card bad"' not in searched
     assert failed.count("no approach was found to any of 12 candidates") == 2 and "Planning failed" in failed
     assert "not requested" not in failed and "only searched" not in failed
     assert "not requested" in searched and "No plan was requested" not in searched and "Planning failed" not in searched

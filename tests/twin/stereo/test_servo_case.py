@@ -10,15 +10,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.geometry.containment import winding_number
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
-from puncture_twin.twin.guidance.stereo.servo_case import (
-    ServoErrors,
-    carried_rod,
-    grid_points,
-    head_pose,
-    load_servo_case,
-    planned_cameras,
-    workcell_checker,
-)
+from puncture_twin.twin.guidance.stereo import servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import configurations, path_contact
 from puncture_twin.twin.plant.stereo_workcell import StereoWorkcell, draw_workcell
 from tools.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets
@@ -29,7 +21,7 @@ TEXT = (HEAD / "servo.toml").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def case():
-    return load_servo_case(HEAD)
+    return servo_case.load_servo_case(HEAD)
 
 
 def written(tmp_path, text):
@@ -49,14 +41,20 @@ def written(tmp_path, text):
         ("holder_mm = 40.0", "holder_mm = 400.0", "out_of_range holder_mm 400"),
         ("rod_diameter_mm = 3.0", "rod_diameter_mm = 9.0", "out_of_range"),
         ("tolerance_mm = 0.1", "tolerance_mm = nan", "bad_value tolerance_mm"),
+        ('model = "ur3"', 'model = "ur3"\nlink_mm = 0.3', "unknown_key link_mm"),
+        ("[errors]", "[rehearsal.errors]", "missing_errors"),
+        ("ball_offset_mm", "ball_ofset_mm", "unknown_key ball_offset_mm"),
+        ("tip_offset_mm = 0.1", 'arm = ["nominal"]', "bad_value errors.arm"),
+        ("hit_radius_mm = 0.5", "hit_radius_mm = 0", "bad_value target.hit_radius_mm"),
     ],
 )
 def test_mistakes_are_named(tmp_path, old, new, what):
+    """Among them an error outside of its table, and a truth beside no belief."""
     assert old in TEXT
     with refused("no_such_file", "servo.toml"):
-        load_servo_case(tmp_path)
+        servo_case.load_servo_case(tmp_path)
     with refused(*what.split()):
-        load_servo_case(written(tmp_path, TEXT.replace(old, new, 1)))
+        servo_case.load_servo_case(written(tmp_path, TEXT.replace(old, new, 1)))
 
 
 def test_the_head_is_open_and_holds_its_targets(case):
@@ -92,9 +90,9 @@ def test_both_cameras_see_every_target_and_marker_and_no_ball_behind_the_head(ca
 def test_the_arm_reaches_everything_without_a_contact(case):
     """Calibration grid, every target from its hovering pose with the head there; no link before the ball."""
     workcell = draw_workcell(case, np.random.default_rng(0))
-    rod, T = carried_rod(case), head_pose(case)
-    calibrated = configurations(rod, grid_points(case), workcell_checker(case, None)).branch
-    targets, checker = apply(T, case.targets.points), workcell_checker(case, T)
+    rod, T = servo_case.carried_rod(case), servo_case.head_pose(case)
+    calibrated = configurations(rod, servo_case.grid_points(case), servo_case.workcell_checker(case, None)).branch
+    targets, checker = apply(T, case.targets.points), servo_case.workcell_checker(case, T)
     hovers = targets - case.file.servo.hover_mm * rod.R_base_flange[:, 2]
     q = configurations(rod, np.concatenate([targets, hovers]), checker, first=calibrated).q
     for aim, hover in zip(q[:16], q[16:], strict=True):
@@ -124,34 +122,17 @@ def without_errors():
 
 
 def test_a_case_that_declares_nothing_has_the_defaults(tmp_path):
-    errors = load_servo_case(written(tmp_path, without_errors())).errors
-    assert errors == ServoErrors()
+    errors = servo_case.load_servo_case(written(tmp_path, without_errors())).errors
+    assert errors == servo_case.ServoErrors()
     assert (errors.link_mm, errors.tip_offset_mm, errors.marker_mm, errors.target_mm) == (0.05, 0.3, 0.3, 0.3)
     assert np.degrees(errors.twist) == pytest.approx(0.005)
     assert errors.ball_px is None
-    assert ServoErrors(arm="nominal").link_mm == 0.5
-    assert ServoErrors(arm="nominal", joint_deg=0.2, marker_mm=0.7).target_mm == 0.7
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "what"),
-    [
-        ('model = "ur3"', 'model = "ur3"\nlink_mm = 0.3', "unknown_key link_mm"),
-        ("[errors]", "[rehearsal.errors]", "missing_errors"),
-        ("ball_offset_mm", "ball_ofset_mm", "unknown_key ball_offset_mm"),
-        ("tip_offset_mm = 0.1", 'arm = ["nominal"]', "bad_value errors.arm"),
-        ("hit_radius_mm = 0.5", "hit_radius_mm = 0", "bad_value target.hit_radius_mm"),
-    ],
-)
-def test_what_contradicts_itself_is_refused(tmp_path, old, new, what):
-    """An error outside of its table, a truth beside no belief, an unknown key, a negative deviation."""
-    assert old in TEXT
-    with refused(*what.split()):
-        load_servo_case(written(tmp_path, TEXT.replace(old, new, 1)))
+    assert servo_case.ServoErrors(arm="nominal").link_mm == 0.5
+    assert servo_case.ServoErrors(arm="nominal", joint_deg=0.2, marker_mm=0.7).target_mm == 0.7
 
 
 def test_what_is_stated_is_read_back():
-    again = ServoErrors.model_validate(CASE.errors.stated())
+    again = servo_case.ServoErrors.model_validate(CASE.errors.stated())
     assert again.arm_deviations() == pytest.approx(CASE.errors.arm_deviations())
     assert again.camera_deviations() == pytest.approx(CASE.errors.camera_deviations())
     assert again.scaled(2.0).head_turn == pytest.approx(2 * again.head_turn)
@@ -163,7 +144,7 @@ def test_the_truth_is_drawn_from_the_declaration():
     keys = {"head_shift_mm": 0.4, "head_turn_deg": 0.2, "tip_offset_mm": 0.5, "needle_direction_deg": 0.3}
     case = varied(CASE, errors=keys)
     rooms = [draw_workcell(case, np.random.default_rng(seed)) for seed in range(ROOMS)]
-    errors, plan = case.errors, planned_cameras(case)[0]
+    errors, plan = case.errors, servo_case.planned_cameras(case)[0]
     moved = np.array([np.linalg.inv(workcell.T_c_m) @ workcell.T_c_m_after for workcell in rooms])
     scatter = {
         "ball": (np.array([workcell.tool.ball_offset for workcell in rooms]), errors.ball_offset_mm),

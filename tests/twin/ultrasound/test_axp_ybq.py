@@ -7,28 +7,14 @@ from scipy.optimize import least_squares
 from selfcal_world import as_estimate, tre
 
 from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.twin.guidance.ultrasound.axp_ybq import equation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
-    N_PARAMETERS,
-    UNWEIGHTED,
-    Problem,
-    active_columns,
-    closed_form,
-    covariances,
-    direction_from_plane,
-    direction_residuals,
-    directions_image,
-    linearised_direction,
-    linearised_tip,
-    mean_direction,
-    tip_residuals,
-)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import refine
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.plant.simulated_recording import PoseRanges, simulate_recording, with_noise
 
-ALL = active_columns(scale=False, direction=False)
+ALL = equation.active_columns(scale=False, direction=False)
 
 
 def difference(estimate, truth):
@@ -46,7 +32,7 @@ def test_the_closed_form_is_exact_without_noise(n, scale):
         exact, truth = simulate_recording(np.random.default_rng(seed), n, noise=None)
         size = np.array([0.2, 0.25]) if scale else np.ones(2)
         recording = Recording(exact.A, exact.B, exact.P / size, exact.v, pixels=scale)
-        found = closed_form(recording, scale=scale)
+        found = equation.closed_form(recording, scale=scale)
         assert max(difference(found, truth)) < 1e-6
         np.testing.assert_allclose(found.scale, size, rtol=1e-9)
 
@@ -62,7 +48,7 @@ def test_the_closed_form_is_the_kronecker_system(rng):
         right.append(A[:3, 3] / 100)
     z = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
     U, _, Vt = np.linalg.svd(z[36:45].reshape(3, 3, order="F"))
-    found = closed_form(recording)
+    found = equation.closed_form(recording)
     np.testing.assert_allclose(found.R_Y, U @ Vt, atol=1e-10)
     tips = [np.trace((U @ Vt).T @ z[9 + 9 * j : 18 + 9 * j].reshape(3, 3, order="F")) / 3 * 100 for j in range(3)]
     assert np.linalg.norm(found.t_Q - tips) < 5  # the linear solution afterwards is near, not equal
@@ -75,20 +61,22 @@ def test_jacobians_are_the_finite_differences(rng, point):
     P, v = recording.P, np.column_stack([recording.v, np.full(12, 0.05)])
     estimate = as_estimate(truth)._replace(scale=np.array([0.9, 1.1]))
     if point != "truth":
-        estimate = estimate.moved(rng.normal(0, 0.3, N_PARAMETERS))
+        estimate = estimate.moved(rng.normal(0, 0.3, equation.N_PARAMETERS))
         P = np.column_stack([P, rng.uniform(-20, 20, 12)])
     recording = Recording(recording.A, recording.B, P, v)
-    v = directions_image(recording, estimate)
+    v = equation.directions_image(recording, estimate)
 
     def both(step):
         moved = estimate.moved(step)
-        return np.hstack([tip_residuals(moved, recording), direction_residuals(moved, recording, v)])
+        return np.hstack([equation.tip_residuals(moved, recording), equation.direction_residuals(moved, recording, v)])
 
-    tip, turn = linearised_tip(estimate, recording), linearised_direction(estimate, recording, v)
+    tip, turn = equation.linearised_tip(estimate, recording), equation.linearised_direction(estimate, recording, v)
     J = np.concatenate([tip.jacobian, turn.jacobian], axis=1)
-    np.testing.assert_allclose(np.hstack([tip.residuals, turn.residuals]), both(np.zeros(N_PARAMETERS)), atol=1e-12)
-    for column in range(N_PARAMETERS):
-        step = np.zeros(N_PARAMETERS)
+    np.testing.assert_allclose(
+        np.hstack([tip.residuals, turn.residuals]), both(np.zeros(equation.N_PARAMETERS)), atol=1e-12
+    )
+    for column in range(equation.N_PARAMETERS):
+        step = np.zeros(equation.N_PARAMETERS)
         step[column] = 1e-4
         slope = (both(step) - both(-step)) / 2e-4
         for part in (slice(0, 3), slice(3, 5)):
@@ -100,13 +88,15 @@ def test_jacobians_are_the_finite_differences(rng, point):
 def test_the_refinement_finds_scipys_minimum(rng, weighted):
     """An independent optimiser with finite differences finds no lower cost and the same answer."""
     recording, _ = simulate_recording(rng, 25)
-    start = closed_form(recording)
-    noise = SPEC_NOISE if weighted else UNWEIGHTED
-    fit = refine(Problem(recording, noise, ALL), start, np.ones(25), np.ones(25))
-    W = np.linalg.cholesky(np.linalg.inv(covariances(fit.estimate, recording, noise, None, 0.0))).transpose(0, 2, 1)
+    start = equation.closed_form(recording)
+    noise = SPEC_NOISE if weighted else equation.UNWEIGHTED
+    fit = refine(equation.Problem(recording, noise, ALL), start, np.ones(25), np.ones(25))
+    W = np.linalg.cholesky(np.linalg.inv(equation.covariances(fit.estimate, recording, noise, None, 0.0))).transpose(
+        0, 2, 1
+    )
 
     def white(step):
-        return (W @ tip_residuals(start.moved(np.append(step, np.zeros(4))), recording)[:, :, None]).ravel()
+        return (W @ equation.tip_residuals(start.moved(np.append(step, np.zeros(4))), recording)[:, :, None]).ravel()
 
     other = least_squares(white, np.zeros(15), x_scale=np.repeat([0.01, 1, 0.01, 1, 1], 3), xtol=1e-14, ftol=1e-14)
     theirs = start.moved(np.append(other.x, np.zeros(4)))
@@ -121,9 +111,9 @@ def test_the_weights_are_the_spread_of_the_residuals(rng):
     estimate, copies = as_estimate(truth), 20000
     many = Recording(*(np.repeat(getattr(exact, key), copies, axis=0) for key in "ABPv"))
     noisy = with_noise(rng, many, SPEC_NOISE)
-    v = directions_image(noisy, estimate)
-    r = np.hstack([tip_residuals(estimate, noisy), direction_residuals(estimate, noisy, v)])
-    expected = covariances(estimate, exact, SPEC_NOISE, directions_image(exact, estimate), 0.0)[0]
+    v = equation.directions_image(noisy, estimate)
+    r = np.hstack([equation.tip_residuals(estimate, noisy), equation.direction_residuals(estimate, noisy, v)])
+    expected = equation.covariances(estimate, exact, SPEC_NOISE, equation.directions_image(exact, estimate), 0.0)[0]
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(np.cov(r.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03)
 
@@ -132,8 +122,8 @@ def test_the_direction_is_the_mean_of_what_was_seen(rng):
     """V = normalise(sum M_i^T v_i): exact without noise, and the image plane alone gives it up to its sign."""
     exact, truth = simulate_recording(rng, 16, noise=None)
     estimate = as_estimate(truth)
-    np.testing.assert_allclose(mean_direction(estimate, exact), truth.direction_end2, atol=1e-12)
-    blind = direction_from_plane(estimate, exact)
+    np.testing.assert_allclose(equation.mean_direction(estimate, exact), truth.direction_end2, atol=1e-12)
+    blind = equation.direction_from_plane(estimate, exact)
     assert abs(blind @ truth.direction_end2) == pytest.approx(1, abs=1e-12)
 
 
@@ -170,7 +160,7 @@ def test_an_unknown_pixel_size_is_found(rng):
     stretched = Recording(recording.A, recording.B, recording.P / 1.03, recording.v)
     held, _ = simulate_recording(rng, 100, truth, noise=None)
     blind, found = calibrate(stretched, noise=SPEC_NOISE), calibrate(stretched, noise=SPEC_NOISE, scale=True)
-    assert len(found.parameters) == N_PARAMETERS
+    assert len(found.parameters) == equation.N_PARAMETERS
     assert np.sqrt(np.mean(tre(blind, held.A, held.B, held.P / 1.03) ** 2)) > 0.6
     assert np.sqrt(np.mean(tre(found, held.A, held.B, held.P / 1.03) ** 2)) < 0.3
     np.testing.assert_allclose(found.scale, 1.03, atol=0.02)

@@ -8,11 +8,7 @@ from selfcal_world import DEGENERATE, as_estimate, cured, degenerate_set, joined
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
-    active_columns,
-    closed_form,
-    tip_residuals,
-)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import active_columns, closed_form, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, observe, scaled_jacobian
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.recording_file import checked_calibration, read_recording, write_recording

@@ -10,15 +10,8 @@ from scipy.stats import binom
 from selfcal_world import as_estimate, tre
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.guidance.ultrasound.axp_ybq import equation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import SHAFT_BIAS, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
-    UNWEIGHTED,
-    Problem,
-    active_columns,
-    closed_form,
-    linearised_tip,
-    tip_residuals,
-)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import predicted_tre
@@ -69,7 +62,7 @@ def test_the_prediction_is_the_mean_over_the_needles_orientations(rng):
         B[:3, :3] = found.Y[:3, :3].T @ A[:3, :3] @ found.X[:3, :3] @ M
         target = (A @ found.X @ np.array([*p, 0, 1]))[:3]
         B[:3, 3] = found.Y[:3, :3].T @ (target - found.Y[:3, 3]) - B[:3, :3] @ found.tip_end2
-        J = linearised_tip(found.estimate, Recording(A[None], B[None], p[None])).jacobian[0][:, :15]
+        J = equation.linearised_tip(found.estimate, Recording(A[None], B[None], p[None])).jacobian[0][:, :15]
         squared.append(np.trace(J @ found.covariance @ J.T))
     assert found.predicted_tre_mm(p, A)[0] == pytest.approx(np.sqrt(np.mean(squared)), rel=1e-9)
 
@@ -102,7 +95,7 @@ def test_a_bias_along_the_shaft_leaves_no_residual(rng):
     assert np.abs(found.residuals).max() < 1e-8
     np.testing.assert_allclose(found.tip_end2 - truth.tip_end2, 2.0 * truth.direction_end2, atol=1e-6)
     assert SHAFT_BIAS in found.cannot_show
-    np.testing.assert_allclose(tip_residuals(found.estimate, biased), 0, atol=1e-8)
+    np.testing.assert_allclose(equation.tip_residuals(found.estimate, biased), 0, atol=1e-8)
     held = calibrate(biased, needle_length_mm=float(truth.tip_end2 @ truth.direction_end2))
     assert held.tip_bias_mm == pytest.approx(2.0, abs=1e-6)
     np.testing.assert_allclose(held.tip_end2, truth.tip_end2, atol=1e-6)
@@ -157,8 +150,8 @@ def test_ten_percent_of_outliers_hardly_matter(known_noise):
         found = calibrate(broken, noise=noise, direction=False)
         assert {recording.names[row] for row in rows} <= set(found.outliers)
         robust.append(np.mean(tre(found, held.A, held.B, held.P) ** 2))
-        active = active_columns(scale=False, direction=False)
-        left = plain_fit(Problem(broken, noise or UNWEIGHTED, active), closed_form(broken))
+        active = equation.active_columns(scale=False, direction=False)
+        left = plain_fit(equation.Problem(broken, noise or equation.UNWEIGHTED, active), equation.closed_form(broken))
         plain.append(np.mean(tre(left, held.A, held.B, held.P) ** 2))
     assert np.sqrt(np.mean(robust)) <= 0.25
     assert np.sqrt(np.mean(plain)) > 2 * np.sqrt(np.mean(robust))

@@ -13,18 +13,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.bodies import surface, touch
 from puncture_twin.planning.geometry.containment import winding_number
 from puncture_twin.planning.geometry.mesh import box
-from puncture_twin.twin.guidance.ultrasound.pose_choice import (
-    TwoArms,
-    between_arms,
-    configurations,
-    draw_geometry,
-    find_candidates,
-    head_pose,
-    inside_phantom,
-    needle_tool,
-    phantom_mesh,
-    probe_tool,
-)
+from puncture_twin.twin.guidance.ultrasound import pose_choice
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
 from puncture_twin.twin.plant.bmode_image import NeedleInImage
 from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell, jog_into_slice
@@ -44,12 +33,12 @@ def case():
 
 @pytest.fixture(scope="module")
 def room(case):
-    return TwoArms(case)
+    return pose_choice.TwoArms(case)
 
 
 @pytest.fixture(scope="module")
 def candidates(case, room):
-    return find_candidates(case, room, np.random.default_rng(5))
+    return pose_choice.find_candidates(case, room, np.random.default_rng(5))
 
 
 def arm_surfaces(model, tool, extra=()):
@@ -70,11 +59,11 @@ def meshes_touch(surfaces, poses):
 
 def test_apart_against_the_links_own_meshes(case, room, candidates):
     """Arms that are apart have meshes that do not touch; meshes that touch belong to arms that are not apart."""
-    between = between_arms(case, case.T_end1_image, case.T_base1_base2, 0.0)
-    head = box(head_pose(case, case.T_end1_image), case.content.probe.head_mm)
+    between = pose_choice.between_arms(case, case.T_end1_image, case.T_base1_base2, 0.0)
+    head = box(pose_choice.head_pose(case, case.T_end1_image), case.content.probe.head_mm)
     surfaces = (
-        arm_surfaces(room.probe_model, probe_tool(case), [(6, head)]),
-        arm_surfaces(room.needle_model, needle_tool(case)),
+        arm_surfaces(room.probe_model, pose_choice.probe_tool(case), [(6, head)]),
+        arm_surfaces(room.needle_model, pose_choice.needle_tool(case)),
     )
     rng = np.random.default_rng(6)
     verdicts = []
@@ -90,7 +79,7 @@ def test_apart_against_the_links_own_meshes(case, room, candidates):
 
 def test_clearance_is_kept(case, room, candidates):
     """Where the arms are apart with a clearance, FCL's distance of their bodies is at least that."""
-    between = between_arms(case, case.T_end1_image, case.T_base1_base2, 0.0)
+    between = pose_choice.between_arms(case, case.T_end1_image, case.T_base1_base2, 0.0)
     for q_probe, q_needle in zip(candidates.q_probe[:6], candidates.q_needle[:6], strict=True):
         assert between.apart(q_probe, q_needle)
         pieces = [
@@ -123,7 +112,7 @@ def test_candidates_show_the_needle_in_the_image(case, room, candidates):
 
 def test_the_face_stays_off_the_phantom(case):
     """Its lowest corner is the gel's thickness above the phantom's upper side, at every tilt."""
-    seen = draw_geometry(case, 200, np.random.default_rng(7))
+    seen = pose_choice.draw_geometry(case, 200, np.random.default_rng(7))
     width, _ = case.content.image.imager().size_mm
     head = case.content.probe.head_mm
     corners = np.array([[width / 2 + a * head[0] / 2, 0.0, b * head[2] / 2] for a, b in product((-1, 1), repeat=2)])
@@ -136,7 +125,7 @@ def test_a_probe_in_the_phantom_is_refused(case, room, candidates):
     """The same pose 12 mm lower: the head is in the tissue."""
     T = np.array(candidates.poses.A[0])
     T[2, 3] -= 12.0
-    lowered = configurations(room.probe_model, T[None], candidates.q_probe[0])[0]
+    lowered = pose_choice.configurations(room.probe_model, T[None], candidates.q_probe[0])[0]
     assert len(lowered) > 0
     assert not any(room.probe_free(q) for q in lowered)
 
@@ -145,17 +134,17 @@ def test_a_needle_arm_out_of_reach_is_an_answer(room):
     """With the base 2 m away nothing can be taken, and the counts say why."""
     far = make_case(needle_arm={"position_mm": [2000.0, 0.0, 0.0]}, poses={"samples": 20})
     with refused("no_pose", by=NoAnswerError) as error:
-        find_candidates(far, room, np.random.default_rng(0))
+        pose_choice.find_candidates(far, room, np.random.default_rng(0))
     assert error.value.counts["needle_out_of_reach"] > 0
 
 
 def test_inside_phantom_against_the_winding_number(case):
     phantom = case.content.phantom
     rng = np.random.default_rng(8)
-    low, high = phantom_mesh(phantom).bounds
+    low, high = pose_choice.phantom_mesh(phantom).bounds
     points = rng.uniform(low - 10.0, high + 10.0, (200, 3))
-    mesh = phantom_mesh(phantom)
-    inside = inside_phantom(phantom, points)
+    mesh = pose_choice.phantom_mesh(phantom)
+    inside = pose_choice.inside_phantom(phantom, points)
     wound = np.array([abs(winding_number(mesh, point)) > 0.5 for point in points])
     nearest = np.array([np.linalg.norm(mesh.vertices - point, axis=1).min() for point in points])
     sure = nearest > 6.0

