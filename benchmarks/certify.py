@@ -4,8 +4,6 @@ python -m benchmarks.certify             times and queries of three anatomies at
 python -m benchmarks.certify --million   a million random directions into certified cells of three anatomies
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from pathlib import Path

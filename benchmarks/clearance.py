@@ -6,8 +6,6 @@ python -m benchmarks.clearance --proof    verdicts and distances instead; exit 1
 python -m benchmarks.clearance --curves   how the cost grows, as docs/pictures/search-cost.png
 """
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -5,8 +5,6 @@ tilted grids, bent needles, a patient who has moved, and things that are no need
 frame; `tests/twin/ct/test_control_scans.py` ties it to a case's.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Iterator

@@ -10,8 +10,6 @@ The scans: the abdomen at .78 x .78 x 1.0 mm, where the shared data are on this 
 with a seed: ellipsoids, ribs and a table, of 512 x 512 x 133 voxels with 89 labels and 512 x 512 x 600 with 100.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

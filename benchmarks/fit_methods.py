@@ -8,8 +8,6 @@ markers are touched in three ways: as an arm that stands far from singular does,
 marker, and as the needle is inserted later. The last column has rooms whose arm errs twice as much as is declared.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

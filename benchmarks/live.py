@@ -10,8 +10,6 @@ is streamed at 50 Hz. The last two rows are the planner's processor time for the
 that does nothing else waits, but for the line.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 import subprocess

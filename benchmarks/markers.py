@@ -6,8 +6,6 @@ markers. Of each scan it counts what is found, what is only listed as doubtful, 
 list holds that is no marker; and whether the errors are as large as their covariance says.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -7,8 +7,6 @@ The limit is printed from the noise that is stated, or from that which each regi
 columns are what the rms without the target's reading would hold, and the upper end of its 95 % interval.
 """
 
-from __future__ import annotations
-
 import sys
 from typing import NamedTuple
 

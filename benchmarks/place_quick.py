@@ -8,8 +8,6 @@ is always given. The last line searches to the end. Behind each stands the worst
 was printed, missed what happened. Seconds are of the clock: on a machine that does nothing else.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import tempfile

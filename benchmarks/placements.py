@@ -7,8 +7,6 @@ of the structures, and an image as it is, noisy, cropped, with every third slice
 shifts of max(6 mm, 1.5 voxels) and more, scales of 5 and 10 %, mirror images, half turns, and reversed arrays.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections import defaultdict

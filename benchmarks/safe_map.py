@@ -8,8 +8,6 @@ of some direction but for a little, less than rounding or FCL's tolerance too; a
 machine, each organ alone, from random targets.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Iterator

@@ -9,8 +9,6 @@ predicted and compared with the truth.
 .venv/bin/python -m benchmarks.selfcal_rooms --only play  # rows whose name contains a word
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from functools import cache

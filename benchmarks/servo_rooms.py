@@ -8,8 +8,6 @@ the arm is sent to one target by the mapping alone, then corrected by one look. 
 play's memory: each arrival errs by itself.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What the benchmarks share: the real CT beside its case, versions, time of one thread, and bodies of many surfaces."""
 
-from __future__ import annotations
-
 import argparse
 import platform
 import shutil

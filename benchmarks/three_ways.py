@@ -10,8 +10,6 @@ see there. A hit is a tip within 2 mm of the true target. The calibration error 
 chance and realised fraction over radii from .25 to 4 mm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple

@@ -11,8 +11,6 @@ true size, so the true size is drawn evenly on a logarithmic scale, as far out a
 rooms with s between 1/8 and 2 of the declaration.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

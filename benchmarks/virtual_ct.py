@@ -3,8 +3,6 @@
 Pixels of 0.7 mm, noise of 20 HU; 240 markers a row (six a scan), and a needle a scan, anywhere in their cells.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

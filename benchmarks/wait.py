@@ -8,8 +8,6 @@ the last rows alone; ``--one-core`` lets a command use one core only. Two checko
 structures, 1 degree, with the arm) is left out where it is not on this machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ was going on: an import, a compiled kernel that is loaded or made, one of `FUNCT
 A name that a checkout lacks is left out, and its time is that of its caller.
 """
 
-from __future__ import annotations
-
 import builtins
 import contextlib
 import importlib

@@ -9,8 +9,6 @@ planning/base), room faces, properties, lambdas and what a decorator writes are 
 while a module is imported or a kernel compiled: the table is the same on a new machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

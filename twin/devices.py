@@ -3,8 +3,6 @@
 ``jp`` are joint positions, ``cp`` is a place in space; `measured` is what a device reads, `move` ends at rest.
 """
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from typing import NamedTuple, Protocol
 

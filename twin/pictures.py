@@ -6,8 +6,6 @@ measures (PS3.3, C.8.5.5); the one region of tissue is cut out, for its surround
 store greys in; what is coloured within the region (flow, rulers) is no tissue, and made known.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path

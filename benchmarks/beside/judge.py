@@ -1,7 +1,5 @@
 """What a safe needle truly passes: its axis against the true surfaces, triangle by triangle, without the product."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One drawn patient: scanned with arms, bed and lines, made a case by `init`, searched, judged against the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple

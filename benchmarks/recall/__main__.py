@@ -9,8 +9,6 @@ counts once). Of each image the case states what a person sees of arms in it (`[
 --undeclared it states nothing, and all beyond a face that cuts the body is unknown. Each image has a cache of its own.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

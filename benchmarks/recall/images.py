@@ -7,8 +7,6 @@ by 6 mm, the largest part, holes filled slice by slice. Beside it: above -300 HU
 or more. Doubtful: 200 HU and more, or gas, within the body and in no label dilated by a voxel, 100 mm3 or more.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -12,8 +12,6 @@ grown by 150 mm; or what the scanner did not measure; or beyond the back of an i
 nothing, or of a real one, where nobody knows the table.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The row of one image: made, searched as a user would, each direction held against the truth."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 import time

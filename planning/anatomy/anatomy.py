@@ -1,7 +1,5 @@
 """The structures of a case, with roles and margins, and the skin: from meshes, label maps, folders of masks, a CT."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -12,8 +12,6 @@ often named by adjectives alone: "superior thyroid" leaves out the artery, so a 
 own.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Metal in a CT: its connected pieces, how much of each voxel is metal, and the middle by these parts."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from typing import Literal, NamedTuple

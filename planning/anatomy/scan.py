@@ -5,8 +5,6 @@ Inside: what is dense (a rib that a segmentation lost, a stent), and gas outside
 that nobody labelled). All of it is of role ``unknown``.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

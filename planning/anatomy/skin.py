@@ -3,8 +3,6 @@
 Where each path from the target crosses the skin, at which angle, and whether what it leaves is known.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The grids on which a case's labels lie: of each label map, and one of each folder or DICOM file of masks.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

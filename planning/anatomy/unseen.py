@@ -9,8 +9,6 @@ TotalSegmentator and Slicer write maps that were cropped to a part of the CT. Th
 the map becomes a closed surface of role ``unknown``; the air beyond it, outside of the skin, does not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 

@@ -13,8 +13,6 @@ Torques show only combinations (Gautier, "Numerical calculation of the base iner
 Syst. 8, 1991): the columns that a pivoted QR of many samples finds independent, each with what it stands for.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple

@@ -4,8 +4,6 @@ Each function is followed by the compiled loop behind it: a plain one over plain
 (d1, a2, a3, d4, d5, d6) in mm.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

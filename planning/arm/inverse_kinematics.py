@@ -5,8 +5,6 @@ UR-5/UR-10 arms", 2013), with the wrist solved by ``atan2`` from the orientation
 its singularity. Frames and lengths are those of :mod:`puncture_twin.planning.arm.kinematics`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Source: the collision shapes of the URDF behind an arm's model: the user's own, 
 ships under its name (``meshes/ur/LICENSE`` says whence).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property

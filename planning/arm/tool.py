@@ -1,7 +1,5 @@
 """What the arm carries and what surrounds it: needle holder and needle, and the workcell's boxes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product

@@ -4,8 +4,6 @@ Source of the Denavit-Hartenberg numbers: Universal Robots, "DH parameters for c
 dynamics"; joint ranges and speeds: the data sheets. An old manual prints d1 = 118 mm for the UR3: wrong.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 A function says what it takes in its signature; `checked` makes it true before the function is called.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

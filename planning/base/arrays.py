@@ -1,7 +1,5 @@
 """The arrays of this project by what they hold; a docstring beside each use gives shape, unit and frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Beside them what a check of plausibility found, and what is said where a part of the installation is missing.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import sys

@@ -1,7 +1,5 @@
 """Files: content hashes, writing that leaves the whole file or nothing, and the bytes of an input file."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tempfile

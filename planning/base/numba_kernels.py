@@ -14,8 +14,6 @@ which it types as this very number: there ``np.int64(0)`` stands for 0. And an a
 the text of an error with it, two seconds of kernels for characters: inside kernels such parts are filled by a loop.
 """
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import json

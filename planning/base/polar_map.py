@@ -5,8 +5,6 @@ bin takes the verdict that comes last in the legend's order among the cells that
 best to the most cautious never shows more as safe than is safe.
 """
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Work on processes, each of which starts anew (libraries with threads do not survive a fork), and on threads."""
 
-from __future__ import annotations
-
 import copyreg
 import multiprocessing
 import os

@@ -3,8 +3,6 @@
 Who embeds it hears of stages (INFO), of what each is at (DEBUG) and of a case's warnings by the logger `LOG`.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterator

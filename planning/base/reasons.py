@@ -5,8 +5,6 @@ three dark tones of Paul Tol's ("Colour Schemes", SRON technical note, 2021); no
 safe.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 from types import MappingProxyType
 

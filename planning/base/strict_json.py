@@ -4,8 +4,6 @@ A key that stands twice has two meanings, of which a reader sees one; NaN and in
 The readers of single values raise what `fitting` turns into one line about the file.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

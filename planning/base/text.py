@@ -3,8 +3,6 @@
 How a value shows itself: one line for ``print`` and a prompt, a piece of HTML for a notebook; neither ever raises.
 """
 
-from __future__ import annotations
-
 import difflib
 import functools
 import html

@@ -1,7 +1,5 @@
 """TOML files of a stated schema: found, bounded, read and validated, with one line for whatever is wrong."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The cases of a cohort: a folder, a CSV, or a TOML file with patterns of cases and a grid of options for each."""
 
-from __future__ import annotations
-
 import csv
 import glob
 import io

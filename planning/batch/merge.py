@@ -4,8 +4,6 @@
 candidates of all cases with the same columns. `compare` says what became safe and what was lost.
 """
 
-from __future__ import annotations
-
 import io
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

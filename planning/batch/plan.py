@@ -4,8 +4,6 @@ A case's id is the hash of its inputs, its options and the version. Its result i
 one rename, with everything in it or not at all.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import io

@@ -6,8 +6,6 @@ a rename that only the first can make. The cohort, its output folder and this pa
 under one path; a worker reads a patient's files itself, and keeps meshes and trees in memory by their bytes.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import re

@@ -5,8 +5,6 @@ pool. The memory of a worker is watched from outside (its resident set), not lim
 compiled code and its threads reserve many times what they use.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -10,8 +10,6 @@ z0 is the place at full exhale, T the period. With phi = pi/2 the period begins 
 position s = (z0 - z) / b runs from 0 (exhale) to 1 (full inhale): s(t) = sin^2n(pi t / T).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

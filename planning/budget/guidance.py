@@ -12,8 +12,6 @@ keeps every margin in the anatomy as the CT shows it. What would go farther is n
 does not hit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

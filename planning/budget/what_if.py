@@ -1,7 +1,5 @@
 """Cost of each error source alone, and what other slices, markers, touches or another arm would leave of the error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ free. So a case states the number of its structures once: in the file's last tab
 at the top, before the first table, where it tells lost structures but nothing that is lost after them.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, get_args

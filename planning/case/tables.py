@@ -3,8 +3,6 @@
 See docs/reference/case.md for the keys.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import unicodedata

@@ -1,7 +1,5 @@
 """A certified map of a cap of directions: the value, its versioned file, and the safe cone that it gives candidates."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from functools import cached_property

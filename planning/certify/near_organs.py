@@ -4,8 +4,6 @@ docs/concepts/certificate.md, lemmas 2 to 4. No distance is needed to prove a ce
 at the limit from every axis of the cell is proof enough, however it was found.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The skin over a cone of directions, in plain numpy, for the checker: the lemmas of docs/concepts/certificate.md."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 docs/concepts/certificate.md derives each bound; `puncture_twin.planning.certify.checker` has the lemmas in plain form.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

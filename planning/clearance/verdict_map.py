@@ -10,8 +10,6 @@ by the distance that the fast engine ends with (`segment_triangle`); within `NEA
 `collides` decides, as in `engine.too_near`. So every verdict is that of `measure_clearances`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

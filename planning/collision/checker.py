@@ -7,8 +7,6 @@ no body touches a closed skin every body is on the base's side of it. For an ope
 surface counts. What is loose (a block of the table) could hide in a link: see `FclSkin`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, cached_property, partial
 from itertools import combinations, pairwise, product

@@ -4,8 +4,6 @@
 joints apart that touch at no angle: proven once for an arm, and not tested again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 

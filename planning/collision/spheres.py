@@ -6,8 +6,6 @@ that side and the points where its edges cross the plane; a sphere about those c
 (docs/concepts/arm-collisions.md).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Each arm alone is checked as everywhere (`planning.collision.fast_checker.FastCh
 two arms against each other are added, with the same bodies.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import product
 

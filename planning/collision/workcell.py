@@ -3,8 +3,6 @@
 Obstacles and gantry are boxes for the arm and solids for the needle, which is checked against them also without an arm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

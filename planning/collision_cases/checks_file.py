@@ -3,8 +3,6 @@
 `line_of` finds the line of a table or key in the text, which the TOML reader does not report.
 """
 
-from __future__ import annotations
-
 import re
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence

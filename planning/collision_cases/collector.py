@@ -1,7 +1,5 @@
 """Tables of a ``*.collision.toml`` file as tests of pytest, one a table, and how each is checked."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Here too is what they leave out: between two slices, between two angles of the search, and organs that nobody named.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

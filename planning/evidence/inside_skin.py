@@ -5,8 +5,6 @@ small organ that is off among many that are right has too few edges to be told b
 elsewhere mostly lies in another organ too. How often that tells: ``python -m slips`` in ``tests``.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

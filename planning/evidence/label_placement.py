@@ -16,8 +16,6 @@ edge that another organ has, around what is not even, is no other place.
 A refused case may state ``[search] trust_labels = true``: its owner has looked, and the finding is a warning.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

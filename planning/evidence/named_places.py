@@ -3,8 +3,6 @@
 Cheaper than the edges of the CT, and of another kind: order needs no CT, and units need no sharp edge.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import NamedTuple

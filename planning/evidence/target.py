@@ -1,7 +1,5 @@
 """What speaks against a target: a vessel's name, the other space, an open mesh around it, a needle too short."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from enum import IntEnum
 from functools import partial

@@ -5,8 +5,6 @@ scan's frame of reference, numbers with units, and sentences. Patient and study 
 compared with what was to be written before anything is published.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import itertools

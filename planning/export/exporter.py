@@ -3,8 +3,6 @@
 Other packages add formats by the entry point group `GROUP`; what they write is held to the same.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -1,7 +1,5 @@
 """The plan as two ``trajectory_msgs/JointTrajectory`` messages in YAML, one for each phase."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -7,8 +7,6 @@ The text is one function and nothing else, not even a comment before it: a contr
 as soon as that is whole, and a second piece would replace the first.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Sequence

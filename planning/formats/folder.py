@@ -4,8 +4,6 @@ An organ may lie in a format that nobody reads, behind a link to a file that is 
 end or in a folder of its own. A reader that looks for what it knows passes it over, and it counts as free.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Collection

@@ -5,8 +5,6 @@ or an empty one; a registration that mirrors would put every organ on the wrong 
 points, and every mesh, goes through here once, and inner code trusts what it gets.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ The first column names the row; groups follow it in a fixed order, each whole or
 passed over. A pose is nine numbers of its rotation, by rows, and its place in mm.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence

@@ -10,8 +10,6 @@ share them there. On which side of an edge the ray passes is then decided rightl
 corner hits at least one of the triangles about it (Woop, Benthin and Wald, JCGT 2(1), 2013).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import Enum

@@ -1,7 +1,5 @@
 """An order of points in which every aligned run of 2^j leaves is a box of a k-d tree, and nothing is stored."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ are of one part (union-find, the older run is the root, so that one pass forward
 Which voxels lie inside a surface: parity of its crossings along grid lines.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -9,8 +9,6 @@ Rotations are computed to the last bit as scipy does it, whose import takes 0.04
 are therefore the C library's: numpy's own differ in the last bit.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@ The engines' searches have kernels of their own, which measure many needles agai
 asks how far a point is from a surface asks here.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The text of a new case: every section with its reason, ending in ``[end]``."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """What a folder holds for a case: CT, segmentations and lists of markers, told by content."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ TotalSegmentator's versions 1 and 2 give the same numbers to other organs. Under
 right, or vertebrae lie in no order: that tells the version.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a person states where `init` would guess or refuse: one option each, so that a refusal can name a way out."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -4,8 +4,6 @@ Is what is named like the body its outline? A path crosses the skin anyway, so a
 body that somebody called ``External`` or ``patient`` is not.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """A folder in, the text of a case out: what is found, whether it fits together, and what a person should look at."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The target of a new case and what holds it; the roles of all structures then, and the region that they show."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType

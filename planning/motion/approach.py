@@ -4,8 +4,6 @@ A fast checker proves whole segments (:class:`SegmentChecker`). With FCL alone a
 samples, which can miss something thin; the check of the finished motion is closer, and what it refuses is planned anew.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass

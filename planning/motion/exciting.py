@@ -6,8 +6,6 @@ Source: Swevers, Ganseman, Tuekel, de Schutter, van Brussel, "Optimal robot exci
 Robot. Autom. 13, 1997. Of many that are drawn, each scaled to the limits, the best conditioned one is taken.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

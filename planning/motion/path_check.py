@@ -1,7 +1,5 @@
 """Checks of a finished joint path: dense states, the first contact, and the least clearance."""
 
-from __future__ import annotations
-
 from heapq import heappop, heappush
 
 import numpy as np

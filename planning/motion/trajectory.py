@@ -1,7 +1,5 @@
 """Joint trajectories: angles over time, and the highest rates that they need."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

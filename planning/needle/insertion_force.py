@@ -7,8 +7,6 @@ here. At the steady speed of an insertion the paper's friction (Karnopp's) is Co
 back to its place: the tip is then in by d, without further work.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

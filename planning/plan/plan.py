@@ -1,7 +1,5 @@
 """The chosen pose and its motion: what is rehearsed, exported and stored; what it touches, and how near it comes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """Whether a plan does what it says, is still its case's, and is free of contact; and how its file states an arm."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A plan as a versioned file, which is checked again by whoever loads it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ A plan is a pose, an approach from home to the standoff and an insertion, both t
 checked as it will be when it is loaded.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ Along a path, from the target outward, mm:
     waiting flange = needle length + standoff
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

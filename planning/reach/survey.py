@@ -3,8 +3,6 @@
 A path along the needle is sampled so closely that what is true of its states is true between them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ It is in `planning` because `init` proposes a registration by it; what the twin 
 (`twin.guidance.ct.markers`) is read in the same way.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -3,8 +3,6 @@
 The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass

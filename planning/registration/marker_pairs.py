@@ -1,7 +1,5 @@
 """Markers paired by name: the same ones in the CT and at the robot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

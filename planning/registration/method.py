@@ -9,8 +9,6 @@ among any k of them the squared differences of their distances sum up to 2 (k - 
 breaks this with its first k names is dropped with all that begin alike, and what is left is complete.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

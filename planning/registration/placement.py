@@ -18,8 +18,6 @@ best for the one insertion whose J_f was taken, and honest for all others.
 What would make a registration better: which marker to leave out, and where one more would help most.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal

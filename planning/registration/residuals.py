@@ -6,8 +6,6 @@ nu s^2 = 3 sum |r_i|^2 / fle^2, distributed as chi-squared with nu = 3 N - 6 deg
 How well a set of markers determines a registration at a point: expected error, and the three flags of a weak set.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple

@@ -5,8 +5,6 @@ clearance of margin and bound is enough whatever side the bevel points to: `with
 `insertion_along` follows one path through its tissues (`path_layers`), `stretches` through the CT.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import groupby
 from typing import NamedTuple

@@ -4,8 +4,6 @@ To first order for all; by line sampling where a limit may decide, and where peo
 For the best of them the chance to touch anything too, all structures linearised together.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

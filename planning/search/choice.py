@@ -3,8 +3,6 @@
 `choose` returns the rows of one choice; `read_entries` and `read_targets` read many choices from a file, one a row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 `first_broken` checks skin and organs of all candidates at once, `with_reach` the arm for those that they leave.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import repeat

@@ -1,7 +1,5 @@
 """One candidate, explained in full: every constraint with its number and its limit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 One of the terms is the safe cone: by how much a direction may be off and still be safe, as far as the grid shows.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

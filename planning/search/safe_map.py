@@ -6,8 +6,6 @@ moves with the breath, what the arm reaches and what errors do is not tested her
 Of many points of a lesion, which one has the widest window: one map a point, with the skin.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

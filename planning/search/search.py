@@ -4,8 +4,6 @@
 direction for skin and organs. `first_blocking` and `organ_safe` give verdicts alone, without distances.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Open sides of the body around a target: from where a needle can come, and which of them the case's grid covers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The candidates table on disk: Parquet, mm and degrees, with the run's provenance in the file's metadata."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

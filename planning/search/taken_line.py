@@ -9,8 +9,6 @@ of its path is measured by the same engine, against the same structures and marg
 with Sigma6 the covariance of the piece's end as it was read, s the depth from there. Nearer is not called safe.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ An error's variance enters every covariance linearly: a source of f times its de
 The registration's weights stay as they are: with better ones the errors could be a little larger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """Windows: connected sets of safe directions, each with its area and its best candidate."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ Arm and holder keep their distance as everywhere. `plan_puncture` goes to where 
 target, in the posture that they were chosen for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise

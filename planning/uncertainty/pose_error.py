@@ -12,8 +12,6 @@ How to touch the markers so that the arm's errors cancel best: touched with the 
 errors of a nominal UR3 fall to a third; touched from elsewhere they add up. Motion and contact are not tested here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

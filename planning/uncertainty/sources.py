@@ -1,7 +1,5 @@
 """The sources of a needle's pose error: what people call them, and which key of ``[errors]`` states each."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 

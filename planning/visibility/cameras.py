@@ -4,8 +4,6 @@ A line of sight is free where it crosses none of the surfaces that are in the wa
 body, the arm's bodies where the plan has them. A ball is seen where its middle and six points about it are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial

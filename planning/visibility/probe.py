@@ -5,8 +5,6 @@ middle of the image looks back along the direction. What is in the way of the so
 arm that holds it, rules the footprint out; of the rest the one with the least depth is taken.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """The body in the error budget: a needle that bends and a breath, each against draws, and only where declared."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import comb
 

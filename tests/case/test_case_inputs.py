@@ -1,7 +1,5 @@
 """Every byte that decides a verdict is read once, hashed as it was read, and listed with its role."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import sys

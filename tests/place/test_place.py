@@ -1,7 +1,5 @@
 """Where to stand the arm: the published shares and windows, the frames, the estimate and the exact answer."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """How a command ends: what it found, its exit code, and one line for what went wrong."""
 
-from __future__ import annotations
-
 import errno
 import sys
 import traceback

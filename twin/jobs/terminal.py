@@ -6,8 +6,6 @@ exception is dropped there: it is raised again. It is put off where it would bre
 module that is half imported stays so, and LLVM's memory is freed twice where its Python side does not learn of it.
 """
 
-from __future__ import annotations
-
 import atexit
 import gc
 import json

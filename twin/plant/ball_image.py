@@ -5,8 +5,6 @@ outline a cell is covered as by a straight edge. The ball's centre errs by less 
 grey level of 140. The lens's blur (a Gaussian), the sensor's noise (normal) and rounding to 8 bits follow.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ of speckle", J. Opt. Soc. Am. 66, 1976); its envelope is Rayleigh, mean over sta
 "Speckle in ultrasound B-mode scans", IEEE Trans. Sonics Ultrason. 25, 1978).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recordings with known truth (spec 3, section 4): two arms, a probe and a needle that lies in the image."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ground truth of a stereo workcell: arm, cameras, head; frames are those of `twin.guidance.stereo.servo_case`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Joint torques of an arm in motion: PyBullet's inverse dynamics, with friction and noise that nobody is told."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from puncture_twin.planning.arm.dynamics import JointMotion

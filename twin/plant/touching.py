@@ -4,8 +4,6 @@ The simulated arm is the nominal one: a pad, square to the needle, stands where 
 marker.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The ground truth of needles and touches: the place of each, for many erring arms at once, and the tissue's force."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ A commanded configuration becomes a true one in three steps: gears stop at the e
 repeatability, and true Denavit-Hartenberg numbers carry the flange.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The ground truth of an ultrasound workcell: two arms as they move, the mounts of probe and needle."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ the plan ends at the trial's own place, and rotated as there, exactly so at the 
     T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the trial found it
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -5,8 +5,6 @@ Modelled are rigid bodies, gravity, motor lag and torque limits, joint offsets, 
 modelled: tissue that moves, breathing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """A self-calibration in the twin: recorded, calibrated, held against what is true; then punctures of seen targets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Stereo sessions in the twin: guidance by its devices, beside each step what is true of it; many seeds of a case."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Words on pictures of pixels with Pillow, in matplotlib's own font: text with a rim, body axes, scale, legend."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Literal

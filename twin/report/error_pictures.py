@@ -1,7 +1,5 @@
 """Pictures of errors: by source and after a change; of the tips of many rooms; over the time of one rehearsal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

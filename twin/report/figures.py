@@ -3,8 +3,6 @@
 What has coordinates is drawn so; words on pictures of pixels (scenes, films) are those of `annotate`, in the same font.
 """
 
-from __future__ import annotations
-
 from io import BytesIO
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Words and numbers that both the pictures and the page print; directions and mounts in the patient's words."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Colours for what the pictures and the page show. Those of the verdicts stand beside the reasons."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

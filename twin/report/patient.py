@@ -1,7 +1,5 @@
 """A patient's search, plan, rehearsal, registration and error budget as blocks that terminal and page both show."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -11,8 +11,6 @@ errors
   2             -
 """
 
-from __future__ import annotations
-
 import math
 import platform
 import re

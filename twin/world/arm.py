@@ -1,7 +1,5 @@
 """The arm as PyBullet reads it (its URDF, holder and needle added), moved by its joint motors, and read back."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 import xml.etree.ElementTree as ET

@@ -1,7 +1,5 @@
 """The PyBullet client, headless and repeatable; and the one place where millimetres become PyBullet's metres."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Execution by the position motors, step by step of the physics, and the contacts that the physics reports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

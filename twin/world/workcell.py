@@ -1,7 +1,5 @@
 """The simulated workcell: arm with needle, patient at their true place, boxes; the world is the controller's base."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -6,8 +6,6 @@ Such a face is a cut: the image ends there, as it once did. Of a phantom a flat 
 there that does not run through it; the key ``cut`` of the skin says what is right where that is not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -8,8 +8,6 @@ Labels explain bones: what has a known name is no evidence, unless that is an ar
 that is larger than a limb can be is one, nor the part that holds the target. All of it on a grid of 4 mm.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache

@@ -5,8 +5,6 @@ slices, or along a hand's breadth. Where it touches a body as dense as itself an
 the body, and it is cut off there. A body that has one section at all four sides is no table, but a phantom.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """An arm's URDF with all that it names, read: its chain, its lengths and the shapes of its bodies."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Callable

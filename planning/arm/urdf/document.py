@@ -1,7 +1,5 @@
 """URDF documents as plain values, mm and rad: links with shapes, and joints. What cannot be read whole is refused."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

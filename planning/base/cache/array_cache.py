@@ -6,8 +6,6 @@ libraries. Anything else is made anew and replaced, and a `CacheWarning` says so
 the least recently used goes first, and nothing of older versions stays.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

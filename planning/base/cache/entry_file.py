@@ -5,8 +5,6 @@ no signature: who may write into the cache can make an entry that passes. So not
 may write.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -3,8 +3,6 @@
 What is kept from one run to the next (surfaces, compiled kernels) is trusted only by code that would make it again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -3,8 +3,6 @@
 A file belongs to the folder's set only if the manifest lists it with the hash of its bytes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter

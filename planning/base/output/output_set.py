@@ -12,8 +12,6 @@ those. Whoever is killed before 1 leaves the old set, after 4 the new one, and b
 lists.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

@@ -3,8 +3,6 @@
 Each disc bounds a block's triangles, or 16 discs of the level below.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ The two that are tested most are written as vectors (`lanes.py`); the loops are 
 branches, no float minimum. The slack of each bound is derived in docs/concepts/fast-search.md.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import types
 

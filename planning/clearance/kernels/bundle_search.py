@@ -5,8 +5,6 @@ Pairs of an axis and a block are filtered in float32 (`_test_block`), the triang
 between the steps do the upper bounds fall.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb

@@ -8,8 +8,6 @@ however badly conditioned, can make the distance too small; and one of them is t
 blocks of 16, tell which faces may be skipped.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

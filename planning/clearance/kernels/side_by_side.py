@@ -7,8 +7,6 @@ branch, the few others singly. As in `segment_triangle.py`, every distance is th
 `Scratch` holds the working arrays of the search of one structure.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ For each bundle: an upper bound for every member, a walk down the tree that coll
 not exceed the worst of them (branch and bound), and `measure_bundle`, which measures these blocks.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb

@@ -9,8 +9,6 @@ three-dimensional space". The nearest point of a triangle: Ericson 2005, "Real-t
 # mypy: disable-error-code="no-untyped-def"
 # numba infers the types
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

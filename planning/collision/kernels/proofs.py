@@ -8,8 +8,6 @@ more than one state: it holds until the bodies may have moved by as much (`first
 # mypy: disable-error-code="no-untyped-def"
 # numba infers the types
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

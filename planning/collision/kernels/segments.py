@@ -5,8 +5,6 @@
 cleared. `check_segment` goes on with each check alone. It calls the kernels of `proofs` and of the arm's kinematics.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ needle, which are round, are tested against each triangle of the skin near them.
 # mypy: disable-error-code="no-untyped-def"
 # numba infers the types
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ Each bound for a body is a lower bound, mm: above 0 it proves that nothing touch
 # mypy: disable-error-code="no-untyped-def"
 # numba infers the types
 
-from __future__ import annotations
-
 import math
 
 from puncture_twin.planning.base.numba_kernels import allocation_free

@@ -1,7 +1,5 @@
 """A CT series as a volume in Hounsfield units and LPS mm."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

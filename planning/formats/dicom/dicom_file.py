@@ -5,8 +5,6 @@ that reads values takes what is left of an element that was cut short, and keeps
 contour or a frame would be lost without a word. So the nesting is checked first (DICOM PS3.5, chapter 7).
 """
 
-from __future__ import annotations
-
 import io
 import math
 import struct

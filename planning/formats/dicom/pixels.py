@@ -1,7 +1,5 @@
 """Stored values of a DICOM image: as many bits as its header says, no more and no fewer bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The contents of a folder of DICOM files, from the headers alone."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

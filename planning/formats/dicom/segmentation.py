@@ -1,7 +1,5 @@
 """DICOM SEG: segments as masks, which may overlap (DICOM PS3.3, A.51 and C.8.20)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

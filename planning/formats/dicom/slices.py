@@ -6,8 +6,6 @@ Names, instance numbers and slice locations are not used: they are often wrong, 
 them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

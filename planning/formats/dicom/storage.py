@@ -3,8 +3,6 @@
 Unique identifiers from DICOM PS3.4 (2024), table B.5-1, and PS3.6, table A-1.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 

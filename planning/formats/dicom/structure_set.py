@@ -1,7 +1,5 @@
 """DICOM RTSTRUCT: contours as masks on the slices of the CT on which they were drawn (PS3.3, C.8.8.5 and C.8.8.6)."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from functools import partial

@@ -4,8 +4,6 @@ Source: Slicer documentation, "Segmentations", file format: ``SegmentN_Name``, `
 file has several layers, ``SegmentN_Layer``, counted from 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -12,8 +12,6 @@ columns, JSON (``{"1": "liver"}``, ``{"liver": 1}``, nnU-Net's ``labels``), labe
 tables of 3D Slicer.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import re

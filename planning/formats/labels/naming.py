@@ -5,8 +5,6 @@ The class numbers are those of TotalSegmentator's main task, versions 1 (104 cla
 2023;5(5):e230024. The versions number organs differently: the aorta is 7 or 52.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import re

@@ -5,8 +5,6 @@ buffer (`glb_document`), accessors against views. Only geometry is read; materia
 Source: Khronos glTF 2.0 specification, sections 3.5 (nodes), 3.6 (binary data) and 3.7 (meshes).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any
 

@@ -12,8 +12,6 @@ end, a vertex that no face uses, fewer faces than a comment counts. What remains
 ``mesh_warnings`` tells. Material files are never opened.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path

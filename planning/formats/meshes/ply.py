@@ -4,8 +4,6 @@ The numbers of an ASCII file are turned into a binary body of doubles, so that o
 Source: G. Turk, "The PLY Polygon File Format", 1994.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ Layout and meaning of the fields: NIfTI-1 standard, nifti1.h (DFWG, 2003), "meth
 A NIfTI affine maps to RAS; everything here leaves in LPS.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 Layout and meaning of the fields: "Definition of NRRD File Format" (Teem project).
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path

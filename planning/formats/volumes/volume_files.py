@@ -5,8 +5,6 @@ the machine. So headers and voxels are read here, from the bytes that were hashe
 against what is there, and nothing is inflated beyond it. The tests hold every value against SimpleITK.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field

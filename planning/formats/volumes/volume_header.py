@@ -1,7 +1,5 @@
 """The checked header of a volume: its shape, its cells' type and size, where its voxels lie; and the stored voxels."""
 
-from __future__ import annotations
-
 import itertools
 import zlib
 from collections.abc import Iterator

@@ -8,8 +8,6 @@ registration swallows without a residual. But markers lie on the skin, and a nee
 so only after a half turn is refused; one that does so before and after it is named in a warning.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

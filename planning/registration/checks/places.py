@@ -4,8 +4,6 @@ Physics tells it: nothing stands in a patient, and a patient lies in no box of t
 asked however a placement is stated, and of what slipped names or axes would make of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

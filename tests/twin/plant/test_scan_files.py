@@ -1,7 +1,5 @@
 """What the scanner writes, read by us, by SimpleITK (as Slicer) and by pydicom: same voxels, same place."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

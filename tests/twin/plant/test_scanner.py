@@ -1,7 +1,5 @@
 """The scanner against what can be computed otherwise: volumes, boxes at fractions of a voxel, dense sampling."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

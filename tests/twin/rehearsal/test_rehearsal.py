@@ -1,7 +1,5 @@
 """A plan executed in the twin: where the tip ends when truth and belief differ in a known way."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

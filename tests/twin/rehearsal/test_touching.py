@@ -1,7 +1,5 @@
 """Touches executed in the twin: what is read, what it is good for, and what stops them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -1,7 +1,5 @@
 """The ball's picture and its measurement: the picture against brute force, the tracker against the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The cameras against data that nobody on this project made: published numbers, and OpenCV as the second engine."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

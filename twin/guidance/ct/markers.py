@@ -4,8 +4,6 @@ The rule of Chen 2019, section 3.1, is a voxel's: the number of the slice that s
 to 1 mm. The finer place is that of the drawn marker nearest to the image (`planning.registration.fiducial_reading`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Needles found in a CT: long, thin metal that comes from outside of the body and has the image of a needle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 

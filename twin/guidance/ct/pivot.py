@@ -9,8 +9,6 @@ with C the covariance of what all n touches miss by and M the projection off A's
 the found tip's covariance is that of A^+ C A^+'.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

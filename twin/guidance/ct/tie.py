@@ -10,8 +10,6 @@ needle's own metal, and the markers', show no surface. Organs move against skin 
 much all of them together is looked for, s, and what is known of the target gets s s' more covariance.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

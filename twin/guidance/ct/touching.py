@@ -4,8 +4,6 @@ How deep a marker lies, the arm feels; a marker that is not where it should be i
 goes on from its standoff. What the arm says is all that is known here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -18,8 +18,6 @@ Projections, chapter 21).
 for studies of everything behind it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

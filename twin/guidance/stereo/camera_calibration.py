@@ -18,8 +18,6 @@ The lens and the pose are refined together by Levenberg-Marquardt (MINPACK, MorÃ
 `camera_slope`; rotations and translations move as  p -> Exp(w) p + t  in the camera's frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

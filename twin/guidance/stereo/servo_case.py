@@ -8,8 +8,6 @@ Two frames matter: the base's, in which the arm is commanded, and C, which the m
 and in which the cameras are known. How C lies in the base only a calibration tells.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path

@@ -16,8 +16,6 @@ target may be off. With equal round errors both agree with the plain fit and Fit
 `configurations` gives one orientation and one inverse-kinematics branch of the rod for every point of a session.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ pointed, in C; ``stops.csv`` the joints at which the ball was looked at, with th
 ``<table>_<row>_<camera>_<n>.png``, all counted from 1, 8 bit grey, as large as the case says.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

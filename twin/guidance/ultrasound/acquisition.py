@@ -1,7 +1,5 @@
 """A recording made by its devices: go to a pose, let the needle be jogged into the slice, take an image, detect."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path

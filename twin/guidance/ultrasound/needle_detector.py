@@ -18,8 +18,6 @@ The needle goes down into the body, so the deeper end is the tip. What shows is 
 a needle that is tilted against the image plane the end that shows need not be the tip, and no image alone can tell.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum

@@ -13,8 +13,6 @@ average it out, and poses that show it correct the aim. The choice does not coun
 noise holds the truth less often than it says.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from enum import StrEnum
 from functools import cache

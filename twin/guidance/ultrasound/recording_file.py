@@ -9,8 +9,6 @@ slips that people make are undone one by one; the one that then fits is named. A
 refused too: its calibration would send the needle anywhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """TOML schema of a self-calibration case, version 1, key by key. See docs/reference/selfcal-case.md."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Self

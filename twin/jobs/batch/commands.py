@@ -1,7 +1,5 @@
 """The commands below ``batch``: they parse, call and print, and load what they need themselves."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Annotated

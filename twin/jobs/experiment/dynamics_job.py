@@ -8,8 +8,6 @@ the covariance C, its spring takes, with the masses L of the tip halfway along t
 which is linear in db: e = G db, and the tip's covariance is G C G'.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

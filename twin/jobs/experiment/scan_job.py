@@ -1,7 +1,5 @@
 """The job ``scan``: a case scanned, its markers, its lesion and a needle found again, and how far off each was."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """`rehearse --sweep`: the needle turned about the target from outside, as far as the planner allows it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

@@ -4,8 +4,6 @@ A reading lies some hundredths of a millimetre from the joints that put the true
 and its drawn twin err alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial

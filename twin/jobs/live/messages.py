@@ -5,8 +5,6 @@ precedes the body; with header version 2 that is an extended header, the content
 CRC-64 of ECMA-182. pyigtl (0.3.4) verifies none, and cannot read a POLYDATA: the tests speak with it.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Mapping, Sequence

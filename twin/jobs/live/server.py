@@ -7,8 +7,6 @@ with something wrong in it is answered. A client is read a limited amount in a t
 size a header claims, and serves one client while others wait.)
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import socket

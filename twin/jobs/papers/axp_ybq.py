@@ -6,8 +6,6 @@ figure of accuracy. Pose ranges, noise and the numbers to compare with are this 
 Every error is the root mean square over 200 held-out exact poses and all runs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ Chen G. et al., "Robot-Assisted Puncture Positioning Methods under CT Navigation
 2019, DOI 10.7652/xjtuxb201904013. The constants below and in `twin.experiment.chen2019` are what the paper prints (mm).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -7,8 +7,6 @@ The paper did not measure what the servo alone leaves, |true ball - estimated ta
 triangle's inequality no target of the table can have less than |after - mapping|.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The papers whose numbers this project prints beside its own, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

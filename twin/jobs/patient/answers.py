@@ -1,7 +1,5 @@
 """The commands that answer without writing files: register, verify, calibrate hand-eye."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import asdict
 from functools import partial

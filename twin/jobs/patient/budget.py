@@ -1,7 +1,5 @@
 """The error budget of a case: what each source costs, what would win the next millimetre, what a corrected aim wins."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

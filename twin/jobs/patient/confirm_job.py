@@ -1,7 +1,5 @@
 """``confirm``: where the needle is in a control CT, what its line touches, what to do next; ``--learn`` from many."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 And a plan for a robot; and the table of candidates as CSV or JSON, read back and equal before it is shown.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json

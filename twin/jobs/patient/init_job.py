@@ -1,7 +1,5 @@
 """The job ``init``: a folder with a CT and a segmentation becomes a case that has been read as a search reads it."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ and returns it with what it found and wrote. A stage loads what it needs itself:
 planner, simulator or plotter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

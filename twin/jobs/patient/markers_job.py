@@ -1,7 +1,5 @@
 """The job ``markers``: markers found in a CT, or places proposed for them, as files for a case and for 3D Slicer."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The pictures and the page of a run; the picture of a needle that was confirmed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The job ``place``: the best position of the arm's base is searched for, written, and printed for a person."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ touched), or where its tip error is clearly larger: by more than two standard er
 what is published of needles that are inserted, scanned and corrected by hand.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a person looks at: B-mode pictures with what was detected, and both arms about the phantom."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The command ``selfcal``: in the twin, or from a recording, to files and the sections that show what was found."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

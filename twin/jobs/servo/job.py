@@ -1,7 +1,5 @@
 """The command ``servo``: a servo case, or a recorded session, from file to facts, sections, pictures and page."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures of a session: the workcell through each camera, and how the servo came to rest."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

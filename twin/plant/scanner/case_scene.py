@@ -1,7 +1,5 @@
 """A case as a scene in the scanner: its structures with Hounsfield units, markers of metal, the table, a needle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

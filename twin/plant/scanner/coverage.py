@@ -6,8 +6,6 @@ nothing leaks through an edge or a corner. A point is inside a solid where its w
 overlap, the later one fills the place.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A scan as DICOM, one CT Image a file (PS3.3, A.3 and C.8.2), or NIfTI-1 (nifti1.h, DFWG 2003), sform in RAS."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import struct

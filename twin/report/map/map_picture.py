@@ -1,7 +1,5 @@
 """``map.png``: every entry direction, seen from outside, with the reason for each refusal; beside it their key."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from itertools import pairwise, zip_longest

@@ -8,8 +8,6 @@ touches nothing that it must not touch is hatching and lines, no colours: they r
 and for colour-blind people. The chance to hit hardly changes with the direction: it stands beside the map as a number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """``placements.png``: the fraction that the arm reaches from each position, each way of mounting it seen from above."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``report.html``: everything about a run on one page that needs no network."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

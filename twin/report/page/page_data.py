@@ -3,8 +3,6 @@
 The scene's bodies are those of the picture, with fewer triangles for a browser, as plotly traces.
 """
 
-from __future__ import annotations
-
 import base64
 import shlex
 from collections.abc import Sequence

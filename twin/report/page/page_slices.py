@@ -3,8 +3,6 @@
 A script of the page (``slices.js``) cuts it and the surfaces in any plane, as `slices.panel` does for ``slices.png``.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import itertools

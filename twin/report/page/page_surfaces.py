@@ -5,8 +5,6 @@ than `APART_MM`, lets the quadrics of Garland and Heckbert (fast-simplification)
 how far the new surface is from the checked one, and back.
 """
 
-from __future__ import annotations
-
 import gzip
 from collections.abc import Iterable
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@
 is text, escaped, or `Markup`, HTML already. A template that names what it is not given is an error.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import io

@@ -12,8 +12,6 @@ And the colour of what a sample shows: smooth normals, one lamp, and glass-like 
 # numba infers the types
 # mypy: disable-error-code="no-untyped-def"
 
-from __future__ import annotations
-
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb

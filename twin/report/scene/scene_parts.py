@@ -3,8 +3,6 @@
 And views of it: of the workcell with the arm, and close to the needle's path.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property

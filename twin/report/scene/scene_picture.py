@@ -1,7 +1,5 @@
 """``scene.png``: the patient with the safe corridor, the needle and the arm, from afar and close by."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Its subject is one direction, its needle and the structures near it, or an image
 the windows that radiologists use, or by one scale of bytes that holds them all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The planes in which a needle's path or an image is looked at, and where each cuts surfaces, needle and tip region."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

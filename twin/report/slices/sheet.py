@@ -1,7 +1,5 @@
 """``slices.png``: slices of a direction and the units along its needle, or of an image; small ones about points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

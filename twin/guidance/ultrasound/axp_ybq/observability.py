@@ -12,8 +12,6 @@ rotated about itself). Those that add most information where there is least are 
 accepted with a margin.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from itertools import product
