@@ -22,8 +22,10 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: install simulator
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
+# In CI, where nothing is compiled yet, the kernels are beside lint and versions: they use one core alone.
+test: export LATER := $(if $(CI),kernels)
 test: install simulator browser
-	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint $(if $(CI),versions)
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target $(LATER) lint $(if $(CI),versions)
 	$(BIN)/pytest -q -n auto --dist loadfile
 
 # Beside this environment: the newest Python, and the lowest version of every part (two minutes; in CI a part of make test).
@@ -84,7 +86,7 @@ reinstall:
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
 	@$(MAKE) --no-print-directory simulator
-	$(MAKE) --no-print-directory kernels
+	$(if $(LATER),,$(MAKE) --no-print-directory kernels)
 	$(STAMP) > $(VENV)/installed
 
 # PyBullet has no wheel after Python 3.11. Where it could not be built, the next make demo or make test tries again.

@@ -68,7 +68,10 @@ class Beyond(NamedTuple):
 
 
 def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO_MEMORY) -> Beyond:
-    """Solids assumed beyond the image of a case's skin, and a CT smaller than that; the same for all targets."""
+    """Solids assumed beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere.
+
+    Of one patient they are the same for every target.
+    """
     at_ends = skin.mesh.vertices[np.unique(skin.mesh.faces[skin.cut_faces])]  # their outlines, and nothing before them
     ends = [] if skin.field_of_view is None else [(skin.field_of_view, at_ends)]
     of_scan = None if scan is None else scan.end()

@@ -158,7 +158,8 @@ def wrap_to_pi(angle: Floats) -> Floats:
 def nearest_within_limits(model: UrModel, q: Floats, q_reference: Floats) -> Floats:
     """The whole turns added to each joint that bring it nearest to a reference without leaving its limits.
 
-    Of joints (..., 6), rad, and so is the result; NaN in all six where some joint has no such turn.
+    Of joints (..., 6), rad, to a reference that broadcasts against them; so is the result. NaN in all six where some
+    joint has no such turn.
     """
     low, high = model.joint_limits[:, 0], model.joint_limits[:, 1]
     fewest, most = np.ceil((low - q) / TURN), np.floor((high - q) / TURN)

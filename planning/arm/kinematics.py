@@ -342,7 +342,10 @@ def tip_rates(model: UrModel, q: Floats, directions: Floats, tip_mm: float) -> F
 
 
 def tip_speeds(model: UrModel, q: Floats, times_s: Floats, tip_mm: float) -> Floats:
-    """The tip's mean speed between the samples of a motion ``q`` (m, 6), rad, at rising times: shape (m - 1,), mm/s."""
+    """The tip's mean speed between the samples of a motion ``q`` (m, 6), rad, at rising times (m,): (m - 1,), mm/s.
+
+    ``tip_mm`` is from flange to tip, along the flange's z.
+    """
     poses = flange_pose(model, q)
     tips = poses[:, :3, 3] + tip_mm * poses[:, :3, 2]
     return np.asarray(np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(times_s))

@@ -58,7 +58,7 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
 def working(jobs: int, pieces: int) -> Iterator[Callable[..., Iterable[Any]]]:
     """What works as ``map`` does, in this process or in several; a function and its results must then be pickled.
 
-    ``jobs``: at most one a core; 1 computes in this process, each piece when its result is taken.
+    ``jobs``: processes, at most one a core; 1 computes in this one, each piece when its result is taken.
     """
     if worker_count(jobs, pieces) == 1:
         yield map

@@ -174,7 +174,7 @@ def distinct(cases: Iterable[plans.PlannedCase]) -> list[plans.PlannedCase]:
 def running(out: Path, part: Part) -> Iterator[Path]:
     """Lock a part of a cohort, or refuse; yields a folder for drafts, which is removed in the end.
 
-    Of a process that dies the system frees the locks, and the next run of the part, or of the whole, the folder.
+    The system frees the locks of a process that dies; its folder is removed by the next run of the part, or of all.
     """
     work = out / f"{plans.WORK_PREFIX}{part.number}-of-{part.parts}"
     with ExitStack() as stack:

@@ -50,7 +50,7 @@ class CaseOptions:
         return f"{{{', '.join(tables)}}}"
 
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
-        """A case file's tables with the options in place, not validated. Raises InputError: a margin of nothing."""
+        """A case file's tables with the options in place, unvalidated. Raises InputError: a margin of what has none."""
         changed = copy.deepcopy(data)
         for kind, values in self.sections.items():
             if kind == MOUNT:

@@ -264,7 +264,10 @@ def mount_pose(mount: tables.MountSection, space: Space, path: Path, *, key: str
 
 
 def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
-    """R_ct_frame (3, 3) of a z axis, and ``x`` as far as square to it. Raises InputError: parallel or zero axes."""
+    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
+
+    Raises InputError: the two are parallel or zero; names ``key``.
+    """
     try:
         return entry_frame(tables.EntryAxes(z=z, x=x), space, where=path)
     except InputError as error:
@@ -276,7 +279,10 @@ URDF_ROLE, MESH_ROLE = "urdf", "urdf mesh"
 
 
 def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
-    """The arm with its home, speeds and place, where stated; its files become inputs. Raises InputError: unusable."""
+    """The arm with its home, its speeds, and where it is, as far as mount or transform say so; its files become inputs.
+
+    Raises InputError: an arm, a mount or a transform that cannot be used.
+    """
     robot, stated, model = content.robot, content.registration, arm_of(content.robot, files, path)
     home = None if robot.home_deg is None else read_only(np.radians(np.asarray(robot.home_deg)))
     mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
@@ -328,7 +334,10 @@ SAME_MM = 0.03
 def bending_of(
     needle: tables.NeedleSection, tissue: Mapping[str, tables.TissueSection], where: str | Path
 ) -> Bending | None:
-    """The bending of a case's needle; None without tissue. Raises InputError: half of it, or another gauge."""
+    """The bending of a case's needle; None where it declares no tissue.
+
+    Raises InputError: half of what is needed, an unknown gauge, or one that is not the needle's diameter.
+    """
     stated = [key for key in ("gauge", "solid", "bevel_deg", "modulus_gpa") if getattr(needle, key) is not None]
     if not tissue:
         if stated:
@@ -360,7 +369,10 @@ def _shaft(needle: tables.NeedleSection, where: str | Path) -> Shaft:
 
 
 def breathing_of(section: tables.BreathingSection | None, space: Space, where: str | Path) -> Breathing | None:
-    """The breathing of a case; None where it declares none. Raises InputError: no direction, or no patient."""
+    """The breathing of a case; None where it declares none.
+
+    Raises InputError: a direction without length, or an anatomical one in a space that knows no patient.
+    """
     if section is None:
         return None
     if isinstance(section.direction, str) and space is Space.LOCAL:

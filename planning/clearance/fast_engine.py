@@ -332,6 +332,8 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
     """Distance of the target from a surface, mm, and the row of the nearest triangle: branch and bound over its tree.
 
     Args:
+        triangles: `Blocks.triangles`, and ``base`` its levels.
+        nodes: `PlacedSurface.nodes`.
         target: Shape (3,), mm.
         slack: Rounding of a node's coordinate, mm.
     """
@@ -351,8 +353,8 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
                 waiting += 1
                 continue
             for row in range(child * LANES, (child + 1) * LANES):
-                of_row = _from_target(triangles, row, target)
-                nearest, distance = row if of_row < distance else nearest, min(of_row, distance)
+                row_distance = _from_target(triangles, row, target)
+                nearest, distance = row if row_distance < distance else nearest, min(row_distance, distance)
     return distance, nearest
 
 

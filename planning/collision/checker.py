@@ -356,7 +356,8 @@ CARRIERS = ("wrist_3", "holder", "needle")
 def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
     """Refuse a tool of which a part touches neither wrist, holder nor needle, nor a part that does.
 
-    Raises InputError: Says how large the tool is and where it lies.
+    A part that hangs on nothing could lie wholly in the patient, unseen. What is looked at of ``bodies``, the arm's,
+    moves with the flange. Raises InputError: Says how large the tool is and where it lies.
     """
     free = [fcl.CollisionObject(convex(padded(piece, APART_MM))) for piece in tool.pieces]
     carriers = [body for body in bodies if body.name in CARRIERS]

@@ -124,7 +124,8 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
 
     The wall, and all that lies outward of it, is farther from the axis than the round bore's radius, between the planes
     of its faces. The distance from the axis is convex, so of the part of a triangle between the planes a corner is
-    farthest: a vertex, or where an edge passes through a plane. A body in the wall has skin there or farther outward.
+    farthest: a vertex, or where an edge passes through a plane. A body in the wall has skin there or farther outward,
+    also where the wall lies wholly inside of it; where the skin is open only its surface counts.
     The checkers' boxes leave a bore up to 0.9 % narrower: a patient who fits the round one is not refused for that.
     """
     at = apply(np.linalg.inv(gantry.T_ct_gantry), skin.vertices)

@@ -116,7 +116,10 @@ class Change:
 
 
 def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
-    """Rewrite a file, whole or not at all; a line a number: where, old, new. Raises InputError: it is another now."""
+    """Rewrite a file, whole or not at all; one line a number: where, old and new.
+
+    Raises InputError: it is another one by now, or cannot be written.
+    """
     path = path.resolve()
     if path.read_bytes() != data:
         refuse("changed while the tests ran", path, "an unchanged file: run again", "input_changed")

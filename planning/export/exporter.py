@@ -153,7 +153,8 @@ def export_plan(
             known off the plan's path, so no corner is rounded, and the file says so.
 
     Raises:
-        InputError: Another format, a plan that contradicts itself, or one beyond the arm's limits; nothing is left.
+        InputError: Another format, a plan that contradicts itself, or a number beyond the arm's limits;
+            then nothing is written.
     """
     path = folder / export_name(source, format_name)
     check_geometry(plan, source)

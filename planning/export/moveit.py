@@ -131,7 +131,7 @@ def moveit_names(stem: str) -> tuple[str, ...]:
 
 
 def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> Mapping[str, str]:
-    """Name to text of the MoveIt files. Raises InputError: a plan that contradicts itself, or breaks a limit."""
+    """Name to text of the MoveIt files. Raises InputError: a plan that contradicts itself, or a number over a limit."""
     check_geometry(plan, source)
     names = moveit_names(source.stem)
     goals = _json({**goal_messages(plan), "warnings": warning_lines(plan.warnings)})

@@ -66,7 +66,7 @@ class JointMove(NamedTuple):
 
 
 def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
-    """The program of a plan, with a radius for each waypoint between the ends of `waypoint_rows`, shape (k - 2,), or 0.
+    """The program of a plan; ``blends_mm`` (k - 2,) of each waypoint between the ends of `waypoint_rows`, None for 0.
 
     Raises InputError: the insertion does not move the tip, or a smooth approach takes too long to stream.
     """
@@ -110,7 +110,10 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
 
 
 def straight_move(model: UrModel, program: Program) -> Trajectory:
-    """The insertion as the controller runs it, straight, on one branch. Raises InputError: none leads to the target."""
+    """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch.
+
+    Raises InputError: no branch leads from the standoff to the target.
+    """
     start, end = program.T_base_standoff[:3, 3], program.T_base_target[:3, 3]
     length = float(np.linalg.norm(end - start))
     times, travelled = _trapezoid(length, program.insertion_mm_s, program.insertion_mm_s2)

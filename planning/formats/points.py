@@ -2,7 +2,8 @@
 
 A CSV states its unit in the header (``name,x_mm,y_mm,z_mm``) and leaves the space to the case; Slicer's files state
 both. Whatever states a patient space arrives in LPS, in mm. Source: Slicer documentation, "Markups" module, file
-formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the coordinate system is a number.
+formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the coordinate system is a number. Version
+1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
 `joint_readings` is the one gate for joint angles: whose arm they are of is checked in `planning/arm/kinematics.py`.
 """
 
@@ -70,7 +71,8 @@ MOST_NAMED = 8
 def read_points(path: Path, *, default_space: Space | None = None, default_unit: Unit | None = None) -> NamedPoints:
     """The points of one file, in mm; in LPS where the file or the caller names a patient space.
 
-    The defaults are of a file that states none: the case's space, or None for a robot's base; no unit refuses the file.
+    ``default_space``, ``default_unit``: of a file that states none; the case's space, or None for a robot's base. None
+    for the unit refuses such a file.
     """
     _reader(path, str(path))  # an unknown ending is refused before anything is read
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
@@ -107,7 +109,10 @@ def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
 
 
 def write_points(path: Path, points: NamedPoints) -> None:
-    """Write a CSV ``name,x_mm,y_mm,z_mm`` and joints, whole, in its case's space. Raises InputError: no such place."""
+    """Write a CSV ``name,x_mm,y_mm,z_mm`` and joints, whole, in the space of its case; it reads back the same.
+
+    Raises InputError: the place cannot be written to.
+    """
     header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
     header += [] if points.joints is None else JOINTS_DEG
     labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)

@@ -94,7 +94,10 @@ def pose_values(T: Floats) -> Floats:
 
 
 def finite_rows(values: Floats, what: str, names: Sequence[str], *, widths: tuple[int, ...]) -> Floats:
-    """A read-only copy of rows (n, k), k one of ``widths``. Raises InputError: another shape, or out of range."""
+    """A read-only copy of an array with a row per pose, shape (n, k), k one of ``widths``, all finite and in range.
+
+    Raises InputError: another shape, or a number that is not finite or out of range; names the pose.
+    """
     array = read_only(values)
     if array.ndim != 2 or len(array) != len(names) or array.shape[1] not in widths:
         wanted = " or ".join(f"({len(names)}, {width})" for width in widths)

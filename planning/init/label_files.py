@@ -79,7 +79,10 @@ def in_box(point_ct: Floats, box: Box, T_ct_index: Floats) -> bool:
 
 def mask_of(file: str, labels: LabelMap) -> Mask | None:
     """The mask in a file; None for an empty one."""
-    return next((Mask(file, label, box, labels.T_ct_index) for label, box in labels.boxes.items()), None)
+    if not labels.boxes:
+        return None
+    ((label, box),) = labels.boxes.items()  # of several none may be dropped: who asks has looked
+    return Mask(file, label, box, labels.T_ct_index)
 
 
 def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str | None) -> Segmentation:

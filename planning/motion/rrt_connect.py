@@ -222,7 +222,10 @@ UNSCALED = 1.0
 
 
 def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Floats) -> Floats:
-    """A path (m, 6), rad, with the same ends, no longer with every joint counted in full, of free segments (k, 6)."""
+    """A path (m, 6), rad, with the ends of one of straight free segments (k, 6), and not longer than it.
+
+    Every joint counts in full for the length; ``joint_limits`` are (6, 2), rad.
+    """
     space = JointSpace(joint_limits, UNSCALED)
     space.set_up(_ShortcutValidator(space.information, contact_of))
     path = og.PathGeometric(space.information)

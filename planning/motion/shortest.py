@@ -153,7 +153,10 @@ SAME_ANGLE = 1e-9
 
 
 class Cut:
-    """Which goals are cut off from home, and by which boxes, as points (p, 3), mm, of the upper arm's frame show."""
+    """Which goals are cut off from home, and by which boxes; found when it is first needed.
+
+    Shown by points (p, 3), mm, that lie within the upper arm, in its frame.
+    """
 
     def __init__(self, model: UrModel, boxes: Sequence[Box], points: Floats, home: Floats, goals: Floats) -> None:
         self._model, self._boxes, self._home, self._goals = model, boxes, home, goals

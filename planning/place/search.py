@@ -197,7 +197,10 @@ def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -
 
 
 def needle_can_start(tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections) -> NDArray[np.bool_]:
-    """Which directions (n,) leave the padded needle at standoff clear of the skin: no placement reaches others."""
+    """Which directions (n,) leave the padded needle at standoff clear of the skin: no placement reaches others.
+
+    Skin and target (3,), mm, CT frame.
+    """
     start, end = tool.needle_span_mm
     radius, length = tool.needle_diameter_mm / 2 + workcell.ARM_PADDING_MM, end - start + 2 * workcell.ARM_PADDING_MM
     needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])

@@ -154,7 +154,7 @@ class Seen(NamedTuple):
 
 
 def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STATED) -> Seen:
-    """Everything on the skin of a CT (HU, canonical axes) that looks like a marker, from head to feet."""
+    """Everything on the skin of a CT (HU, axes to the left, back, head) that looks like a marker, from head to feet."""
     kinds = tuple(one for one in get_args(Kind) if stated.kind in (None, one))
     noise, ceiling = noise_hu(volume.values), clipped_at(volume.values)
     found, passed, voxel = list[Fiducial](), list[Passed](), float(spacing_mm(volume).max())
@@ -313,7 +313,7 @@ def order_along_body(points_ct: Floats) -> list[int]:
 def find_fiducials(
     volume: Volume, skin: Skin, stated: Stated, layout: NamedPoints | None = None, *, where: str | Path
 ) -> Seen:
-    """The markers of a CT (HU, canonical axes), named by a layout (any frame, mm) or from head to feet.
+    """The markers of a CT (HU, axes to the left, back, head), named by a layout (any frame, mm) or from head to feet.
 
     Raises NoAnswerError: None, too few, too many, several sizes, or none that a layout tells; it says what was seen.
     Raises InputError: A layout that is mirrored.

@@ -99,7 +99,10 @@ def rms(vectors: Floats) -> float:
 
 
 def rigid_fre_mm(points_ct: Floats, points_base: Floats) -> float:
-    """The FRE (rms residual), mm, of `fit_rigid` of points (n, 3): the chi-squared test is about that."""
+    """The FRE (rms residual), mm, of `fit_rigid`: the chi-squared test is about that.
+
+    Of points (n, 3), n >= 3, not collinear, mm.
+    """
     return rms(apply(fit_rigid(points_ct, points_base), points_ct) - points_base)
 
 

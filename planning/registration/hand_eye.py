@@ -113,6 +113,8 @@ class PosePairs(Shown):
 def read_pose_pairs(path: Path, *, motions: bool = False) -> PosePairs:
     """Pairs of poses from a CSV: ``name``, ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``, and the same for B.
 
+    With ``motions`` its rows are motions.
+
     Raises InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
     """
     content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
@@ -211,7 +213,9 @@ class HandEye(Shown):
 
 
 def calibrate_hand_eye(pairs: PosePairs, noise: HandEyeNoise | None = None) -> HandEye:
-    """Solve A X = Z B of three poses or more, or A X = X B of two motions; None as noise finds the spreads.
+    """Solve A X = Z B of three poses or more, or A X = X B of two motions, with rotations about two axes.
+
+    ``noise`` is of both; None finds the residuals' spreads.
 
     Raises InputError: Too few poses, rotations that cannot show X, or poses that fit only in another reading, or in
     none.

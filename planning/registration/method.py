@@ -139,8 +139,8 @@ class Renamings(NamedTuple):
 def renamings(markers: MarkerPairs, target_ct: Floats, alike_mm: float, *, moving_mm: float = HARMLESS_MM) -> Renamings:
     """Permutations of three names or more whose rigid fit has an FRE of at most ``alike_mm``.
 
-    Those that move neither the target (3,) nor a marker by more than ``moving_mm`` against the fit as named are left
-    out.
+    Those that move neither the target (3,), mm, nor a marker by more than ``moving_mm`` against the fit as named are
+    left out.
     """
     x, y = (points - points.mean(axis=0) for points in (markers.points_ct, markers.points_base))
     bound = len(markers) * alike_mm**2

@@ -154,7 +154,10 @@ def aimed(registration: Registration, aim: Aim) -> Registration:
 def aimed_uncertainty(
     fit: FitUncertainty, points_ct: Floats, T_base_ct: Floats, target_base: Floats, aim: Aim
 ) -> FitUncertainty:
-    """The uncertainty of a joint fit of markers (N, 3) whose pose was corrected, turned about a target (3,), mm."""
+    """The uncertainty of a joint fit of markers (N, 3), mm, whose pose was corrected.
+
+    ``T_base_ct`` (4, 4) is the corrected pose, ``target_base`` (3,), mm, where it was turned about.
+    """
     A = design(apply(T_base_ct, points_ct), fit.center_base)
     M = np.eye(len(A)) - A @ fit.fit_map
     weights = np.asarray(np.linalg.inv(fit.noise.covariance(fit.R_base_ct).whole), dtype=np.float64)
@@ -212,7 +215,7 @@ def without_each(registration: Registration, target_ct: Floats) -> tuple[Without
 def one_more(registration: Registration, target_ct: Floats, skin_points_ct: Floats) -> OneMore | None:
     """The place among skin points (n, 3), mm, where one more marker, read and touched alike, leaves the least error.
 
-    None without declared errors.
+    That is the error at the target (3,), mm. None without declared errors.
     """
     uncertainty, markers = registration.uncertainty, registration.markers
     points = skin_points_ct

@@ -94,7 +94,7 @@ class ResidualTest:
 
     @property
     def fle_mm(self) -> float:
-        """The noise to compute with, rms length: declared (and scaled), or no less than a floor.
+        """The noise to compute with, rms length: declared (and scaled), or estimated and never below a floor.
 
         The estimate is <FRE^2> = (1 - 2/N) <FLE^2> (Fitzpatrick 1998).
         """

@@ -89,9 +89,9 @@ class Insertion(NamedTuple):
 def insertion_along(
     bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
 ) -> Insertion:
-    """Deflection, forces and buckling of the insertion along one direction (3,), unit, to a target (3,), mm.
+    """Deflection, forces and buckling of the insertion along one direction (3,), unit, outward from the target.
 
-    The path's length is from there to the skin, mm.
+    The path ends at ``end_ct`` (3,), mm, the target; its length is from there to the skin, mm.
     """
     layers = path_layers(bending, anatomy, end_ct, outward_ct, path_length)
     stiffest = max(layer.tissue.stiffness_n_mm2 for layer in layers)
@@ -173,7 +173,8 @@ class Stretch(NamedTuple):
 def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float) -> tuple[Stretch, ...]:
     """Follow a path from the target (3,), LPS mm, to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT.
 
-    ``outward_ct`` (3,) is a unit vector; of NaN length, without an entry, nothing is followed.
+    ``outward_ct`` (3,) is a unit vector, and ``path_length``, mm, from target to skin; NaN without an entry: nothing is
+    followed.
     """
     if anatomy.scan is None or not np.isfinite(path_length):
         return ()
@@ -194,7 +195,7 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
 def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
     """Which depths (n,), mm, of a path from a target (3,) along a unit vector (3,) are inside a closed structure.
 
-    By the parity of the crossings before.
+    By the parity of the crossings before; depths are from the target outward.
     """
     points = target_ct + depths[:, None] * outward_ct
     low, high = structure.mesh.bounds

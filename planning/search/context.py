@@ -200,7 +200,8 @@ class CaseContext(Shown):
     def regions_ct(self, q: Floats) -> Floats | None:
         """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (n, 3, 3), mm^2, CT axes.
 
-        Of joints ``q`` (n, 6), rad, the tip on the target; NaN where these are. None without declared errors.
+        Of joints ``q`` (n, 6), rad, the tip on the target; where they are NaN (the arm does not reach it) the region is
+        too. None without declared errors.
         """
         if self.chance is None:
             return None

@@ -160,9 +160,9 @@ WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "to be 
 
 
 def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:
-    """The uncertainty breakdown of a direction (3,) at joints (6,), rad, the tip on the target.
+    """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
 
-    Its chances are line-sampled as those of the table's best are.
+    Of a unit vector (3,) from the target along the needle, and joints (6,), rad, the tip on the target.
     """
     needle = (outward_ct[None], q[None])
     chances = refined_chances(model, *needle, model.chances(*needle))

@@ -171,7 +171,7 @@ def refined_chances(
 
 
 def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
-    """Whether needles, as of `chances`, satisfy the case's limits in any configuration at the target: shape (n,)."""
+    """Whether needles, as of `ChanceModel.chances`, satisfy the limits in any configuration at the target: (n,)."""
     kept, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
     if least is not None:
         kept &= model.hit_chance(model.error.covariance_ct(q)) >= least

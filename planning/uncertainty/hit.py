@@ -67,7 +67,11 @@ def hit_model(
 
 
 def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
-    """The chance (n,) that the tip, of covariances (n, 3, 3), mm², is within a radius of the intended point."""
+    """The chance (n,) that the tip is within a radius of the intended point.
+
+    By covariances (n, 3, 3), mm², of tip against that point, any frame; ``freedom``: the degrees of the errors' size,
+    where the residuals gave it.
+    """
     values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
     if freedom is None:
         return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
@@ -175,7 +179,10 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
-    """A ball about the target for a tip that is believed elsewhere, off by (3,), mm: a known mean error besides."""
+    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
+
+    The offset (3,), mm, is the believed tip minus the target, in the covariance's axes.
+    """
     directions = even_directions(DIRECTIONS)
     along = directions @ offset
     inside = along**2 - offset @ offset + radius_mm**2  # below 0 the ray misses the ball
@@ -187,7 +194,10 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
 
 
 def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, surface_mm: float = 0.0) -> Floats:
-    """The chance (n,) that the tip, of covariances (n, 3, 3), mm², CT axes, is in a mesh that may lie off whole."""
+    """The chance (n,) that the tip is within a mesh, which may lie off by ``surface_mm`` as a whole.
+
+    By covariances (n, 3, 3), mm², of tip against mesh, CT axes; ``freedom`` as of `hit_in_ball`.
+    """
     if surface_mm > 0 and rays.moved is not None:
         z = ndtri((np.arange(SURFACES) + 0.5) / SURFACES)
         lying = [replace(rays, depth=rays.depth + off * rays.moved) for off in surface_mm * z]
@@ -275,7 +285,7 @@ class Proximity:
 def proximity(
     distance: Floats, depth: Floats, normal: Floats, outward_ct: Floats, cov_ct: Floats, surface_mm: Floats | float
 ) -> Proximity:
-    """The first-order model of n needles and k structures, by distances (n, k), mm.
+    """The first-order model of n needles along unit vectors (n, 3) and k structures, by distances (n, k), mm.
 
     ``depth`` (n, k) is that of the nearest axis point, mm from the target, and ``normal`` (n, k, 3), unit, points from
     the structure to it; Sigma6 (n, 6, 6), CT axes, is about the target; along the normal each surface may lie off as a
@@ -336,7 +346,7 @@ def touch_bound(
     A needle that leans may touch a structure far from where it is nearest, which first order does not see. No point of
     the axis is nearer than the nearest, and none is more doubtful than the worse end: the variance is convex in depth.
     ``slack_mm`` (n, k) is the distance beyond the threshold, ``surface_mm`` the most that a surface may lie off along
-    any normal, one number or (k,); the others as of `proximity` and `touch_chance`.
+    any normal, one number or (k,), ``length_mm`` the axis' length; the others as of `proximity` and `touch_chance`.
     """
     lever = np.concatenate([np.broadcast_to(np.eye(3), (len(cov_ct), 3, 3)), -length_mm * skew(outward_ct)], axis=-1)
     ends = np.stack([cov_ct[:, :3, :3], lever @ cov_ct @ np.swapaxes(lever, -1, -2)])

@@ -241,9 +241,10 @@ class AnyPose(NamedTuple):
     ) -> Floats:
         """Clearance at which no needle touches a structure more often than ``chance``, whatever its shape, (k,), mm.
 
-        Beyond ``farthest`` (the structure's greatest distance from the target) the axis leaves the structure by as much
-        as it goes on, which is more than it is displaced by as soon as it has left it by ``beyond``: deeper points
-        never decide.
+        Beyond ``farthest`` (k,), the structures' greatest distances from the target, the axis (of lengths (k,)) leaves
+        a structure by as much as it goes on, which is more than it is displaced by as soon as it has left it by
+        ``beyond``: deeper points never decide. Surfaces lie off by (k,) as a whole at most; ``freedom`` is that of the
+        residuals that gave the noise's size, None where it is declared.
         """
         count = 5 + int((surface_mm > 0).any())  # normals: shift, lean across the axis, the surface's
         square = chdtri(count, chance) if freedom is None else count * fdtri(count, freedom, 1.0 - chance)
@@ -304,8 +305,10 @@ class Candidates(NamedTuple):
 def choose_touches(error: PoseError, points_base: Floats, q_insertion: Floats) -> Floats:
     """Joints that touch each marker (N, 3), mm, shape (N, 6), rad, and leave the least error at the target.
 
-    Of the case's error the registration's map is kept, and its touches are replaced. Raises NoAnswerError: A marker
-    that the arm cannot touch near the orientation of the insertion (6,), rad.
+    The markers are in the order of the registration's, the insertion (6,), rad, has the tip on the target. Of the
+    case's error the registration's map is kept, and its touches are replaced.
+
+    Raises NoAnswerError: A marker that the arm cannot touch near the insertion's orientation.
     """
     found = [touch_candidates(error.model, error.tip_mm, point, q_insertion) for point in points_base]
     candidates = [one.alike if len(one.alike) else one.others for one in found]
@@ -321,7 +324,8 @@ def least_error(error: PoseError, candidates: Sequence[Floats], q_insertion: Flo
     """One candidate of each marker, shape (N, 6), rad, that together leave the least error at the target.
 
     Marker by marker the candidate of the least trace(Sigma_dd) is taken, given the others, until nothing changes; the
-    most error (``worst``) is for comparison. The error as of `choose_touches`, candidates (n, 6) of each marker.
+    most error (``worst``) is for comparison. Error and insertion as of `choose_touches`; candidates (n, 6), rad, of
+    each marker.
     """
     maps = error.fit.map_at(error.target_base)[:3].reshape(3, -1, 3)
     eta, repeatability = error.fit.noise.eta_variances, error.errors.arm.repeatability
@@ -345,7 +349,8 @@ def least_error(error: PoseError, candidates: Sequence[Floats], q_insertion: Flo
 def touch_candidates(model: UrModel, tip_mm: float, point_base: Floats, q_insertion: Floats) -> Candidates:
     """Configurations within the joint limits and away from singularities that touch a point, near the insertion's.
 
-    The point (3,) in mm, the insertion (6,) in rad: by its orientation, or leaning from it by up to `TILTS_DEG`.
+    ``tip_mm`` is from flange to tip, the point (3,) in mm, the insertion (6,) in rad: by its orientation, or leaning
+    from it by up to `TILTS_DEG`.
     """
     R = flange_pose(model, q_insertion)[:3, :3]
     sides = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)

@@ -167,7 +167,9 @@ def camera_view(context: CaseContext, plan: Plan | Watched) -> CameraView:
 
 
 def candidate_pairs(T_ct_bed: Floats) -> tuple[Floats, Floats]:
-    """Pairs of cameras about the target, the origin of the bed frame, side by side and one above the other.
+    """Pairs of cameras about the origin of the bed frame, side by side and one above the other.
+
+    That is ``T_ct_bed`` (4, 4), mm, z up, its origin on the target.
 
     Returns:
         Cameras, shape (n, 2, 3), CT mm, and the direction to the middle of each pair, shape (n, 3), unit.

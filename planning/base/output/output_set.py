@@ -124,7 +124,7 @@ def writing(
 def withdraw(out: Path, command: str, *, keep: Iterable[str] = ()) -> None:
     """Remove what a command left earlier, where a new run was refused: an old answer must not stand beside it.
 
-    Nothing is touched where it has not written; ``keep`` are files that stay: they may be the input.
+    Nothing is touched where no command has written; ``keep``: files of its entry that stay, as they may be the input.
     """
     if out.is_dir() and manifest.read_manifest(out):
         with writing(out, command) as draft:

@@ -59,7 +59,10 @@ class Slice:
 
 
 def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
-    """The slices of a CT file of so many frames, but for scouts. Raises InputError: no usable place or rescaling."""
+    """The slices of a CT file of so many frames; scouts among those of an enhanced one are left out.
+
+    Raises InputError: a place, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
+    """
     if sop_class_of(data, where=file) == CLASSIC_CT:
         if frames != 1:
             what = f"{name('NumberOfFrames')} is {frames} in a CT image of one slice"
@@ -178,7 +181,11 @@ class Stack:
 
 
 def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
-    """The stack that slices make. Raises InputError: too few, several geometries, two at one place, or uneven steps."""
+    """The stack that slices make.
+
+    Raises InputError: fewer than two, other orientations or pixel sizes, several at one place, a step that is missing,
+    or uneven steps; the slices are named.
+    """
     if len(slices) < 2:
         refuse(f"{len(slices)} slice", where, "a series of at least 2 slices", "too_few_slices")
     first = slices[0]

@@ -97,12 +97,15 @@ class Selection:
 
 
 class OwnNames(Protocol):
-    """A label map that may bring names of its own: label to name."""
+    """A label map that may bring names of its own."""
 
     @property
-    def path(self) -> Path: ...  # noqa: D102  the class says it
+    def path(self) -> Path:
+        """Its file."""
+
     @property
-    def names(self) -> Mapping[int, str] | None: ...  # noqa: D102
+    def names(self) -> Mapping[int, str] | None:
+        """Label to name, or None."""
 
 
 def is_naming_file(naming: str | None) -> bool:
@@ -151,11 +154,13 @@ def select(
     Of equally specific ``avoid`` patterns the largest margin holds, and of ``unknown`` ones.
 
     Args:
-        avoid: Pattern to margin in mm, as ``unknown``, of which it is unknown whether a path may cross them.
+        avoid: Pattern to margin in mm.
+        unknown: The same of structures of which it is unknown whether a path may cross them.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
 
     Raises:
-        InputError: A label without a name, a pattern, or one kind; a pattern of no known name; a margin out of range.
+        InputError: A label present that has no name or that no pattern names, or that two equally specific patterns of
+            different kinds name; a pattern that matches no name although all are known; a margin out of range.
     """
     free = ([(one, 0.0) for one in listed] for listed in (traverse, target, ignore))
     tables = zip(RuleKind, (avoid.items(), unknown.items(), *free), strict=True)

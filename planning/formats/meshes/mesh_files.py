@@ -269,7 +269,10 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
 
 
 def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
-    """`mesh_warnings` by name, from the cache for meshes seen before; all then have what `TriangleMesh.known` takes."""
+    """`mesh_warnings` of each mesh, by name, from the cache for meshes seen before.
+
+    The meshes know then whether they are closed and wound alike, see `TriangleMesh.known`.
+    """
     made_from = {"what": "mesh warnings", "meshes": [(name, mesh.digest) for name, mesh in meshes.items()]}
 
     def found() -> Arrays:

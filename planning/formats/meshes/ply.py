@@ -53,7 +53,10 @@ _Columns = dict[str, NDArray[Any] | _Lists]
 
 
 def read_ply(data: bytes, where: str) -> RawMesh:
-    """The faces of a PLY file, polygons cut into fans. Raises InputError: header and data do not fit, or no face."""
+    """The faces of a PLY file; polygons are cut into fans, other elements are passed over.
+
+    Raises InputError: header and data do not fit each other, or there are no faces.
+    """
     elements, body = _split(data, where)
     cursor = _Cursor(body, where)
     vertices: NDArray[np.float64] | None = None

@@ -38,7 +38,10 @@ class _Polygons(NamedTuple):
 
 
 def read_vtk(data: bytes, where: str) -> RawMesh:
-    """The polygons of a legacy VTK file, cut into fans. Raises InputError: cut, too few numbers, or triangle strips."""
+    """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface.
+
+    Raises InputError: it is cut, of another kind, has fewer numbers than it states, or holds triangle strips.
+    """
     cursor = _Cursor(data, where)
     version = _VERSION.fullmatch(cursor.line())
     cursor.line()  # the title, which anything may be

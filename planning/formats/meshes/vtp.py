@@ -30,7 +30,10 @@ _HEADER_TYPES = {"UInt32": "u4", "UInt64": "u8"}
 
 
 def read_vtp(data: bytes, where: str) -> RawMesh:
-    """The polygons of a VTP file, cut into fans. Raises InputError: cut, arrays of another length, or strips."""
+    """The polygons of a VTP file; polygons are cut into fans; points and lines in it carry no surface.
+
+    Raises InputError: it is cut, an array is shorter or longer than stated, or it holds triangle strips.
+    """
     written, appended = _split_appended(data, where)
     if b"<!" in written.replace(b"<!--", b""):
         refuse("a document type or CDATA section", where, "VTK's own XML, without either", "xml_doctype")

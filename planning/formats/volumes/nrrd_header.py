@@ -192,7 +192,10 @@ def _header(raw: NrrdText, path: Path, layers: int = 1) -> VolumeHeader:
 
 
 def data_file(content: bytes, path: Path) -> str | None:
-    """The file beside a detached header with its data, by name, or None. Raises InputError: damaged, or elsewhere."""
+    """The name of the file beside a detached header that holds its data; None where header and data are one file.
+
+    Raises InputError: a damaged header, or data elsewhere than in the file or beside it.
+    """
     raw = split_header(content, path)
     return None if raw.data_path == path else raw.data_path.name
 

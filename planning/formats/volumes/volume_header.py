@@ -82,7 +82,10 @@ def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:
 
 
 def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.float64]:
-    """The affine (4, 4), voxel index to mm, read-only. Raises InputError: not finite, singular or implausible."""
+    """The affine (4, 4), voxel index to mm, read-only.
+
+    Raises InputError, named: not finite, zero or singular, implausible spacing, sheared, implausible origin.
+    """
     T = np.array(T_ct_index, dtype=np.float64)
     if not np.isfinite(T).all():
         refuse("the affine has NaN or infinity", where, "finite numbers", "not_finite")

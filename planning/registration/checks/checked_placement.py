@@ -212,6 +212,8 @@ def placement_findings(
 ) -> tuple[Finding, ...]:
     """Check what places the robot: the markers, a mount, or a stated transform and the markers beside it.
 
+    However it is stated, what physics says of the place of the base is told (`base_place`).
+
     Markers that agree with a transform are checked as those that place the robot are: who made the transform from the
     same two lists has the slip of a list in both.
     """

@@ -167,7 +167,10 @@ def _crosses(mesh: TriangleMesh, points: Floats, directions: Floats, length_mm: 
 
 
 def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Floats:
-    """Where on the skin a marker could sit and be touched straight, shape (n, 3), mm; arguments as of `in_box`."""
+    """Where on the skin a marker could sit and be touched straight: no box before it, within reach, shape (n, 3), mm.
+
+    Arguments as of `in_box`.
+    """
     a, b, c = np.moveaxis(skin.triangles[:: max(1, len(skin.triangles) // SKIN_POINTS)], 1, 0)
     normals = np.cross(b - a, c - a) * np.copysign(1.0, skin.volume)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
