@@ -20,15 +20,10 @@ from puncture_twin.planning.base.cache.source_stamp import PROJECT, closure, sou
 from puncture_twin.planning.base.errors import CacheWarning
 
 BY = "puncture_twin.planning.anatomy.surfaces"
-MAKERS = (
-    "puncture_twin.planning.anatomy.surfaces",
-    "puncture_twin.planning.anatomy.scan",
-    "puncture_twin.planning.formats.meshes.mesh_files",
-    "puncture_twin.planning.clearance.fast_engine",
-    "puncture_twin.planning.collision.packed",
-    "puncture_twin.planning.collision.proofs",
-    "puncture_twin.twin.report.page.page_data",
-)
+CHECKOUT = Path(__file__).resolve().parents[2]
+SOURCES = [*(CHECKOUT / "planning").rglob("*.py"), *(CHECKOUT / "twin").rglob("*.py")]
+KEEPING = [one.relative_to(CHECKOUT).with_suffix("") for one in SOURCES if "by=__name__" in one.read_text("utf-8")]
+MAKERS = (BY, *sorted({"puncture_twin." + ".".join(one.parts) for one in KEEPING} - {BY}))
 """Every module whose results are kept."""
 
 

@@ -153,7 +153,7 @@ def test_a_head_that_hides_a_target_loses_the_ball():
         pixels, pictures = pixel_detector(plant, 0.03), image_detector(plant)
 
         def see(*look):
-            return (pictures if plant._head_there else pixels)(*look)
+            return (pictures if plant.head_there else pixels)(*look)
 
         return see
 
