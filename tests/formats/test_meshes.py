@@ -146,6 +146,17 @@ g one\nusemtl x\ns off\nf 1/1/1 2/1/1 3/1/1\nl 1 2\n# Faces: 1\n"""
     assert len(read(tmp_path, ".obj", text.encode()).faces) == 1
 
 
+def test_an_obj_of_meshlab_is_whole(tmp_path: Path) -> None:
+    """Its faces are stated above and below, and its last line has no line end; no other may lack it."""
+    text = b"# Vertices: 3\n# Faces: 1\n" + OBJ_CORNERS + b"f 1 2 3\n# 1 faces, 0 coords texture\n\n# End of File"
+    assert len(read(tmp_path, ".obj", text).faces) == 1
+    with refused("file_cut"):
+        read(tmp_path, ".obj", text[:-1])
+    for stated in (b"# 1 faces", b"# Faces: 1"):
+        with refused("size_mismatch", 2):
+            read(tmp_path, ".obj", text.replace(stated, stated.replace(b"1", b"2")))
+
+
 def test_a_model_as_slicer_saves_it() -> None:
     """What VTK 9.3.1's own writer makes of a sphere: appended base64, zlib, normals, the field SPACE, empty cells.
 

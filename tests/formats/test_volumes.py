@@ -190,14 +190,14 @@ def test_nrrd_values_are_simpleitks_bit_for_bit(tmp_path: Path, order: str, name
     values = stored_values(dtype)
     raw = values.tobytes()
     typed = (("type", f"type: {name}"), ("endian", f"endian: {order}"))
-    write(tmp_path, "a.raw", raw)
+    write(tmp_path, "a b.raw", raw)
     write(tmp_path, "a.raw.gz", gzip.compress(raw))
     packed = ("encoding", "encoding: gzip")
     contents = {
         "raw.nrrd": nrrd_bytes(*typed, data=raw),
         "gzip.nrrd": nrrd_bytes(*typed, packed, data=gzip.compress(raw)),
         "gzip.nhdr": nrrd_bytes(*typed, packed, ("data file", "data file: a.raw.gz"), data=b""),
-        "raw.nhdr": nrrd_bytes(*typed, ("data file", "data file: a.raw"), data=b""),
+        "raw.nhdr": nrrd_bytes(*typed, ("data file", "data file: a b.raw"), data=b""),
     }
     for file, content in contents.items():
         path = write(tmp_path, file, content)
@@ -364,6 +364,7 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "no_such_file"),
     "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "outside_folder"),
     "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "outside_folder"),
+    "points at two files": ("a.nhdr", nrrd_bytes(("data", "data file: a.raw\tb"), data=b""), "outside_folder"),
     "points at itself": ("a.nhdr", nrrd_bytes(("data", "datafile: a.nhdr"), data=b""), "data_elsewhere"),
     "an attached file that points": ("a.nrrd", nrrd_bytes(("data", "Data File: /etc/passwd")), "outside_folder"),
     "layers of segments": ("a.seg.nrrd", nrrd_bytes(*FOUR_D), "wrong_dimension"),

@@ -36,12 +36,13 @@ _IGNORED = frozenset({"vt", "vn", "vp", "o", "g", "s", "mg", "usemtl", "mtllib",
 """Lines without a surface in them: texture, normals, names, groups, materials, polylines, points."""
 _ALLOWED = "lines v, f, and " + ", ".join(sorted(_IGNORED))
 _STATED_COUNT = re.compile(r"#\s*faces\s*:\s*(\d+)|#\s*(\d+)\s+(?:faces|triangles)\b", re.IGNORECASE)
+_LAST_LINE = "\n# End of File"  # MeshLab writes it without a line end
 
 
 def read_obj(data: bytes, where: str) -> RawMesh:
     """The faces of an OBJ file, of all its objects and groups; polygons are cut into fans."""
     text = decode_text(data, where)
-    if not text.endswith("\n"):
+    if not text.endswith(("\n", _LAST_LINE)):
         what = "the last line has no line end: the file may be truncated"
         refuse(what, where, "a line end after every line", "file_cut")
     text = text.replace("\\\r\n", " ").replace("\\\n", " ")
@@ -62,7 +63,8 @@ def read_obj(data: bytes, where: str) -> RawMesh:
         what = f"{unused} vertices are not used by any face: the face list may be truncated"
         allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
         refuse(what, where, allowed, "unused_vertices")
-    stated, there = sum(int(first or second) for first, second in _STATED_COUNT.findall(text)), len(counts)
+    by_form = [sum(int(count) for count in form if count) for form in zip(*_STATED_COUNT.findall(text), strict=True)]
+    stated, there = max(by_form, default=0), len(counts)  # MeshLab states all its faces in both forms
     if stated > there:
         refuse(f"comments state {stated} faces, but there are {there}", where, "as many as stated", "size_mismatch")
     return RawMesh(np.array(vertices, dtype=np.float64), faces)

@@ -64,7 +64,7 @@ def split_header(content: bytes, path: Path) -> NrrdText:
     if "datafile" in fields:
         name = fields["datafile"]
         allowed = "the name of one file in the same folder"
-        if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
+        if not name or re.search(r"[/\\%\0]|[^\S ]", name) or name in (".", "..") or name.upper().startswith("LIST"):
             refuse(f"data file {name[:80]!r}", path, allowed, "outside_folder")
         data_path = path.parent / name
         if not is_plain_file(data_path):
