@@ -24,7 +24,7 @@ def plan(case, candidates):
     return world.make_plan(case, candidates)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def browser():
     from page_browser import chromium  # here: without playwright its tests alone are skipped
 
