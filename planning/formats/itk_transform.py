@@ -234,13 +234,7 @@ def hdf5_transforms(content: bytes, where: str) -> list[StatedTransform]:
         there = [name for name in names if name in group]
         if len(there) > 1:
             refuse(f"{group.name} with {' and '.join(there)}", where, ALLOWED, "stated_twice")
-        data = dataset(group, there[0]) if there else None
-        if data is None or data.size > MAX_NUMBERS:
-            return np.empty(0)
-        if data.dtype not in (np.float64, np.float32) or data.ndim != 1:
-            what = f"{data.name} of {data.dtype} with shape {data.shape}"
-            refuse(what, where, "a list of floats or doubles", "wrong_type")
-        return np.asarray(data[()], dtype=np.float64)
+        return _list_of(dataset(group, there[0]), where) if there else np.empty(0)
 
     try:
         with h5py.File(BytesIO(content), "r") as file:
@@ -254,6 +248,16 @@ def hdf5_transforms(content: bytes, where: str) -> list[StatedTransform]:
     except _DAMAGED as error:
         what = f"not a complete HDF5 file ({str(error)[:120]})"
         raise InputError(what, where=where, allowed=ALLOWED, code="file_damaged") from error
+
+
+def _list_of(data: Any, where: str) -> Floats:
+    """The numbers of a dataset; none where they are too many for a linear transform."""
+    if data.size > MAX_NUMBERS:
+        return np.empty(0)
+    if data.dtype not in (np.float64, np.float32) or data.ndim != 1:
+        what = f"{data.name} of {data.dtype} with shape {data.shape}"
+        refuse(what, where, "a list of floats or doubles", "wrong_type")
+    return np.asarray(data[()], dtype=np.float64)
 
 
 def _numbered(parent: Collection[str], where: str) -> list[str]:

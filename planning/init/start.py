@@ -96,10 +96,6 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     carved = {name for name, fraction in border.items() if fraction >= segmentation.ALL_ROUND}
     holding = target.holding._replace(others=target.holding.others | carved)
     roles = [targets.assign(one.names, region, holding, left_out, stated) for one in found.segmentations]
-    # Those whose points lie in the CT come first.
-    within = [ct is None or all(map(ct.surfaces.source.grid.holds, one.points.points)) for one in found.markers]
-    order = sorted(zip(within, found.markers, strict=True), key=lambda pair: (not pair[0], pair[1].source))
-    markers = tuple(one for _, one in order)
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,
@@ -110,13 +106,20 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         ct=None if ct is None else ct.source,
         skin=skin_source,
         sources=tuple(zip(found.segmentations, roles, strict=True)),
-        markers=markers or tuple(filter(None, [seen])),
+        markers=_in_order(found.markers, ct) or tuple(filter(None, [seen])),
         left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
     notes = [*_notes(request, found, target.notes, parts, holding), *of_seen]
     notes += segmentation.carved_notes(parts.rows, holding.target, border)
     return Start(case_text(parts), parts, (*notes, *outlines.notes(target.point_ct)), seen)
+
+
+def _in_order(markers: Sequence[Markers], ct: Ct | None) -> tuple[Markers, ...]:
+    """Lists whose points lie in the CT first, then by the names of their files."""
+    within = [ct is None or all(map(ct.surfaces.source.grid.holds, one.points.points)) for one in markers]
+    order = sorted(zip(within, markers, strict=True), key=lambda pair: (not pair[0], pair[1].source))
+    return tuple(one for _, one in order)
 
 
 def _refuse_outside(point: Floats, space: Space, ct: Ct, skin: TriangleMesh) -> None:

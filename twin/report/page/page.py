@@ -63,7 +63,7 @@ def write_page(shown: Shown, path: Path) -> None:
     """Write the page; it appears whole or not at all."""
     case, found, plan, done = shown.case, shown.candidates, shown.plan, shown.rehearsal
     at_patient, away = () if shown.facts is None else shown.facts.rows(), numbers.demanding(shown.anatomy)
-    declared, pick, scan = shown.uncertainty is not None, shown.chosen, shown.anatomy.scan
+    declared, scan = shown.uncertainty is not None, shown.anatomy.scan
     point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
     study, warned = scan_date(case), (*(one.sentence for one in found.findings), *shown.anatomy.warnings)
     noted = tuple(one.sentence for one in shown.anatomy.findings if one.severity is Severity.NOTE)
@@ -72,16 +72,7 @@ def write_page(shown: Shown, path: Path) -> None:
         alt = "True tip to true target, and true needle to true structures, over time"
         curves = present.picture(rehearsal_png(done, away), alt)
         rehearsed = [*patient.rehearsal(done, away, shown.film, shown.failures), curves]
-    subject = shown.subject or Subject(case, shown.anatomy, pick or Pick(found, 0))
-    slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
-    data = {
-        "map": map_data(case, found, pick, shown.raster),
-        "scene": scene_figure(shown),
-        "arm": arm_data(shown),
-        "slices": slices,
-        "target": [float(v) for v in case.target_ct],
-        "probe_mm": float(case.needle.length_mm),
-    }
+    data, ct, surfaces = _script_data(shown)
     write_html(
         "report.html",
         path,
@@ -112,6 +103,22 @@ def write_page(shown: Shown, path: Path) -> None:
         plotly=plotly_script(),
         **_uncertain_sections(shown.uncertainty, shown.registration),
     )
+
+
+def _script_data(shown: Shown) -> tuple[dict[str, Any], bytes, bytes]:
+    """What the page's script draws, and what its slices need: the CT, and the surfaces that they cut."""
+    case, found, pick = shown.case, shown.candidates, shown.chosen
+    subject = shown.subject or Subject(case, shown.anatomy, pick or Pick(found, 0))
+    slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
+    data = {
+        "map": map_data(case, found, pick, shown.raster),
+        "scene": scene_figure(shown),
+        "arm": arm_data(shown),
+        "slices": slices,
+        "target": [float(v) for v in case.target_ct],
+        "probe_mm": float(case.needle.length_mm),
+    }
+    return data, ct, surfaces
 
 
 def _all_rejected(found: Candidates) -> str:
