@@ -314,6 +314,7 @@ BROKEN = [
     ("obj-face-list-cut", ".obj", OBJ[: OBJ.index(b"\nf ") + 1], "empty"),
     ("obj-faces-cut", ".obj", OBJ[: OBJ.index(b"\n", OBJ.index(b"\nf ") + 99) + 1], "unused_vertices"),
     ("obj-fewer-than-counted", ".obj", OBJ_CORNERS + b"# Faces: 2\nf 1 2 3\n", "size_mismatch"),
+    ("obj-endless-count", ".obj", OBJ_CORNERS + b"# Faces: " + b"9" * 5000 + b"\nf 1 2 3\n", "size_mismatch inf"),
     ("obj-index-too-high", ".obj", OBJ_CORNERS + b"f 1 2 4\n", "index_out_of_range"),
     ("obj-index-zero", ".obj", OBJ_CORNERS + b"f 0 1 2\n", "index_out_of_range"),
     ("obj-index-too-negative", ".obj", OBJ_CORNERS + b"f -4 1 2\n", "index_out_of_range -4"),

@@ -63,10 +63,11 @@ def read_obj(data: bytes, where: str) -> RawMesh:
         what = f"{unused} vertices are not used by any face: the face list may be truncated"
         allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
         refuse(what, where, allowed, "unused_vertices")
-    by_form = [sum(int(count) for count in form if count) for form in zip(*_STATED_COUNT.findall(text), strict=True)]
-    stated, there = max(by_form, default=0), len(counts)  # MeshLab states all its faces in both forms
+    # As floats: `int` refuses a text of 5,000 digits.
+    by_form = [sum(float(count) for count in form if count) for form in zip(*_STATED_COUNT.findall(text), strict=True)]
+    stated, there = max(by_form, default=0.0), len(counts)  # MeshLab states all its faces in both forms
     if stated > there:
-        refuse(f"comments state {stated} faces, but there are {there}", where, "as many as stated", "size_mismatch")
+        refuse(f"comments state {stated:.0f} faces, but there are {there}", where, "as many as stated", "size_mismatch")
     return RawMesh(np.array(vertices, dtype=np.float64), faces)
 
 
