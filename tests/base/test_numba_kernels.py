@@ -71,7 +71,7 @@ def folders(project):
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
     """A package that keeps kernels, and its kernel, kept: of one that takes in another's, which names a constant."""
-    project = tmp_path_factory.mktemp("project")
+    project = tmp_path_factory.mktemp("kernels") / "project"
     for name in (*EMPTY, *COPIED):
         copy = project / "puncture_twin" / name
         copy.parent.mkdir(parents=True, exist_ok=True)

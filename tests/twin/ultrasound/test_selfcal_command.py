@@ -39,7 +39,8 @@ def case_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def done(case_folder, tmp_path_factory):
-    out = tmp_path_factory.mktemp("out")
+    """The folder of results, with the kept pictures in ``kept`` beside it, in a folder that no other test shares."""
+    out = tmp_path_factory.mktemp("selfcal_done") / "out"
     record = out.with_name("kept")
     assert main(["selfcal", str(case_folder), "--seeds", "1", "--out", str(out), "--record", str(record)]) == OK
     return out
