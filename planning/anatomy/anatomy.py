@@ -25,7 +25,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
 from puncture_twin.planning.case.tables import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.label_sources import check_one_grid
-from puncture_twin.planning.formats.labels.labelmaps import frame, framed_surface
+from puncture_twin.planning.formats.labels.labelmaps import LabelEnds, frame, framed_surface
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, RuleKind, names_for, select
 from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings, parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
@@ -48,6 +48,8 @@ class StructureSources:
         self._cache = cache
         self._volumes: dict[str, VolumeSurfaces] = {}
         self._imaged: dict[tuple[str, int | None], Imaged] = {}
+        self.ends: dict[str, LabelEnds] = {}
+        """Of the labels in each label map and mask that was read, by its name as the case writes it."""
         self.warnings: list[str] = []
         self.ignored: list[str] = []
 
@@ -91,6 +93,7 @@ class StructureSources:
         self._check_grid(next(iter(grids.values())), folder)
         names = dict(enumerate(files, start=1))
         masks = {number: self._open(files[name]).mask() for number, name in names.items()}
+        self.ends |= {file: mask.ends for file, mask in zip(files.values(), masks.values(), strict=True)}
         present = [number for number, mask in masks.items() if mask.labels]
         self.warnings.extend(said for number, mask in masks.items() for said in mask.notes(Path(files[names[number]])))
         if empty := [name for number, name in names.items() if number not in present]:
@@ -189,7 +192,9 @@ class StructureSources:
         known, volume = name in self._volumes, self._volume(name)
         if not known:
             self._check_grid(volume.source.grid, name)
-            self.warnings.extend(volume.present().notes(volume.path))
+            present = volume.present()
+            self.ends[name] = present.ends
+            self.warnings.extend(present.notes(volume.path))
         return volume
 
     def _check_grid(self, grid: VolumeGrid, name: str) -> None:
@@ -296,7 +301,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         progress("unnamed tissue in the body")
         structures.extend(_unnamed(case, scan, structures))
     unseen = beyond_images(case, skin, scan, cache.memory)
-    beyond, ending = beyond_labels(case, skin, structures, cache.memory)
+    beyond, ending = beyond_labels(case, skin, structures, loader.ends, cache.memory)
     outside = (*outside, *unseen.structures)
     structures.extend(beyond)
     _check_names(case, [*structures, *outside])

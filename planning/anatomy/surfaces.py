@@ -21,7 +21,15 @@ from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.label_sources import refuse_label_map
-from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, label_mesh, labelmap_of, segment_names
+from puncture_twin.planning.formats.labels.labelmaps import (
+    ROUNDED_BY,
+    LabelEnds,
+    LabelMap,
+    label_ends,
+    label_mesh,
+    labelmap_of,
+    segment_names,
+)
 from puncture_twin.planning.formats.volumes.volume_files import Volume, VolumeSource, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -38,10 +46,11 @@ in a CT: the body, and what was not measured."""
 
 
 class Present(NamedTuple):
-    """The labels of a map or mask that have a voxel, ascending, and how far its values are off whole numbers."""
+    """The labels of a map or mask that have a voxel, ascending, how far its values are off whole numbers, and ends."""
 
     labels: tuple[int, ...]
     rounded_by: float
+    ends: LabelEnds
 
     def notes(self, path: Path) -> tuple[str, ...]:
         """Notes for a person on how a file was read."""
@@ -259,7 +268,8 @@ def cached_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
 
 
 def _of_present(labels: LabelMap) -> Arrays:
-    return {"labels": np.array(labels.labels_present(), np.int64), "rounded_by": np.array(labels.rounded_by)}
+    present = np.array(labels.labels_present(), np.int64)
+    return {"labels": present, "rounded_by": np.array(labels.rounded_by), **label_ends(labels)._asdict()}
 
 
 def _to_present(stored: Arrays, fewest: int = 1, most: float = np.inf) -> Present:
@@ -267,7 +277,10 @@ def _to_present(stored: Arrays, fewest: int = 1, most: float = np.inf) -> Presen
     whole = labels.ndim == 1 and labels.dtype == np.int64 and fewest <= len(labels) <= most
     if not whole or not 0.0 <= rounded_by <= ROUNDED_BY:
         raise ValueError("no list of labels")
-    return Present(tuple(labels.tolist()), rounded_by)
+    ends = LabelEnds(stored["last"], stored["flat_mm2"])
+    if any(one.shape != (len(labels), 3, 2) for one in ends) or [one.dtype.kind for one in ends] != ["i", "f"]:
+        raise ValueError("no ends of its labels")
+    return Present(tuple(labels.tolist()), rounded_by, ends)
 
 
 def _of_content(content: Content) -> Arrays:

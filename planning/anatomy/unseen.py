@@ -3,13 +3,15 @@
 At each face of the image that cuts the body its outline there is drawn on outward, also past neighbouring faces that
 cut it, and is widened to the sides by what the case states or by what is usual. What the solid leaves free is air.
 
-What lies in the body beyond the box of a label map: no organ there has a label, so it is not known to be free.
+What lies in the body beyond a label map: no organ there has a label, so it is not known to be free.
 
-TotalSegmentator and Slicer write maps that were cropped to a part of the CT. The part of the body beyond each face of
-the map becomes a closed surface of role ``unknown``; the air beyond it, outside of the skin, does not.
+TotalSegmentator and Slicer write maps that were cropped to a part of the CT, and lay them on a larger grid, with zeros
+around. So a map ends at its grid's faces, and at a plane in which several labels end flat with nothing beyond: organs
+end round. The part of the body beyond each such face becomes a closed surface of role ``unknown``; the air beyond it,
+outside of the skin, does not.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +21,12 @@ from puncture_twin.planning.anatomy.body.cut_ends import SIDES, FieldOfView
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import LabelGrid, Role, Structure, label_grids
-from puncture_twin.planning.base.arrays import Floats, widened
+from puncture_twin.planning.base.arrays import Floats, Ints, widened
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.labels.labelmaps import mask_surface
+from puncture_twin.planning.formats.labels.label_sources import on_one_grid
+from puncture_twin.planning.formats.labels.labelmaps import LabelEnds, mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
@@ -48,8 +51,15 @@ TANGENTS = 32
 VOXELS_OF_SLACK, CELL_MM = 1.0, 2.0
 """A map may end so many voxels inside the skin's box: the skin itself is found to that. And the least edge of the cells
 by which the body beyond a map is found; it is widened by one cell to all sides."""
+FEWEST_FLAT, ORGAN_MM2 = 2, 2000.0
+"""So many labels that end flat in one plane, with nothing beyond, were cut there, or one with so large an end: of the
+real abdomen's labels none ends by itself flat over more than 600 mm2, and no two in one plane."""
 ENDS = (
     "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
+)
+ENDS_FLAT = (
+    "; its grid goes on, but its labels were cut off there, as it seems (flat ends in one plane: {flat}; if they end "
+    "so by themselves, a label of what lies beyond says so)"
 )
 
 
@@ -198,9 +208,15 @@ def _finding(view: FieldOfView, what: Assumed, own: str) -> Finding:
 
 
 def beyond_labels(
-    case: Case, skin: Skin, structures: Sequence[Structure], memory: Memory = NO_MEMORY
+    case: Case,
+    skin: Skin,
+    structures: Sequence[Structure],
+    ends: Mapping[str, LabelEnds],
+    memory: Memory = NO_MEMORY,
 ) -> tuple[tuple[Structure, ...], tuple[str, ...]]:
     """The body beyond the label maps that end in it, as one structure or none, and a warning for each such map.
+
+    The ends of their labels are given by file, as the case writes its name.
 
     An organ that the map would have shown demands its margin of the needle's surface. So the margin of what is beyond
     is the largest that the case demands of any label of the map, and half a voxel more: a label that ends at the map's
@@ -210,20 +226,22 @@ def beyond_labels(
     """
     meshes, margins, warnings = list[TriangleMesh](), [0.0], []
     for grid in label_grids(case):
-        voxels = grid.voxels
-        if not voxels.holds(case.target_ct):
+        voxels, (faces, flat) = grid.voxels, _shown(case, grid, ends)
+        target = apply(np.linalg.inv(voxels.T_ct_index), case.target_ct[None])[0]
+        if np.any((target < faces[0]) | (target > faces[1])):
             what = f"label map {grid.name} does not contain the target, so its surroundings are unknown"
+            what += ENDS_FLAT.format(flat=flat.max()) if voxels.holds(case.target_ct) else ""
             refuse(what, case.path, "label maps that contain the target", "labels_end")
         sections = [one for one in case.structures if one.source == grid.name]
         named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
         margin = max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])
         margin += float(voxels.spacing_mm.max()) / 2
-        body, faces = _near_body(case, skin.mesh, voxels, margin, memory), np.full((2, 3), -0.5)  # low and high
-        faces[1] += voxels.shape
+        body = _near_body(case, skin.mesh, voxels, margin, memory)
         gaps = (faces - body) * [[1.0], [-1.0]]  # voxels by which the body goes on beyond each face of the map
         if gaps.max() <= VOXELS_OF_SLACK:
             continue
         said = ENDS.format(name=grid.name, voxels=gaps.max())
+        said += ENDS_FLAT.format(flat=flat[gaps > 0.0].max()) if flat[gaps > 0.0].any() else ""
         if not skin.mesh.closed:
             allowed = "a label map of the whole body about the target, or a closed skin"
             refuse(f"{said} (the skin is open)", case.path, allowed, "labels_end")
@@ -238,6 +256,34 @@ def beyond_labels(
     at_map = np.zeros((3, 3))  # where the map ends is known; the margin has half a voxel
     solid = Structure(BEYOND_LABELS, Role.UNKNOWN, max(margins), joined(meshes), BEYOND_LABELS, voxel_ct=at_map)
     return (solid,), tuple(warnings)
+
+
+def _shown(case: Case, grid: LabelGrid, ends: Mapping[str, LabelEnds]) -> tuple[Floats, Ints]:
+    """Low and high face, voxels, of what a map shows, and how many of its labels were cut off there; shapes (2, 3).
+
+    Where none was, it is the grid's face. A label beyond, in any map on the same grid, says that the others end there
+    by themselves; and the rods of a phantom do.
+    """
+    faces, voxels = np.array([np.zeros(3), grid.voxels.shape]) - 0.5, grid.voxels
+    files = [name for name in ends if on_one_grid(case.volumes.source(name).grid, voxels)]
+    last = np.concatenate([ends[name].last for name in files])
+    if case.region == "phantom" or not len(last):
+        return faces, np.zeros((2, 3), int)
+    own = LabelEnds(*map(np.concatenate, zip(*(ends[name] for name in grid.files), strict=True)))
+    planes, flat = cut_off(own, last)
+    return np.where(flat, planes, faces), flat
+
+
+def cut_off(own: LabelEnds, last: Ints) -> tuple[Floats, Ints]:
+    """The planes behind which no label lies, voxels, and how many of a map's labels were cut off there; shapes (2, 3).
+
+    ``last`` are the ends of all labels on its grid, (n, 3, 2).
+    """
+    outermost = np.stack([last.min(axis=0)[:, 0], last.max(axis=0)[:, 1]])
+    flat_mm2 = np.where(own.last == outermost.T, own.flat_mm2, 0.0)
+    flat = np.count_nonzero(flat_mm2, axis=0).T
+    flat[(flat < FEWEST_FLAT) & (flat_mm2.max(axis=0, initial=0.0).T < ORGAN_MM2)] = 0
+    return outermost + [[-0.5], [0.5]], flat
 
 
 def _near_body(case: Case, skin: TriangleMesh, voxels: VolumeGrid, margin_mm: float, memory: Memory) -> Floats:

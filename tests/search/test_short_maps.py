@@ -1,12 +1,18 @@
 """A label map that ends in the body: what lies beyond is unknown, never free; compared along the map's own axes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from case_world import write_case
+from case_world import ORGAN, SKIN, case_text, structure, write_case
+from places import DATA, REAL_CT
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.anatomy.unseen import ORGAN_MM2, cut_off
+from puncture_twin.planning.formats.labels.labelmaps import LabelEnds, label_ends, labelmap_of
+from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.search.context import prepare
 
@@ -110,3 +116,108 @@ def test_what_was_unsafe_is_never_safe_with_a_cropped_map(tmp_path, before, kept
 def test_a_map_that_does_not_hold_the_target_is_refused(tmp_path):
     with refused("labels_end", "labels.nrrd"):
         verdicts(tmp_path / "cut", vessels()[:, :, 55:], (0, 0, 55))
+
+
+ORGANS = (
+    (52, 0, 24), (54, 24, -30), (-50, 8, 30), (-54, -12, -26), (4, 52, 28), (-18, 54, -12), (8, -52, 6), (14, 6, 58),
+)  # fmt: skip
+"""Middles of round organs, of 20 mm, in the body of 90 mm; each plane of `BLANKED` cuts two or more."""
+
+
+def organs():
+    """Their labels, axes z, y, x."""
+    at = np.arange(100) * STEP_MM - 99.0
+    z, y, x = np.meshgrid(at, at, at, indexing="ij")
+    labels = np.zeros(z.shape, np.uint8)
+    for number, middle in enumerate(ORGANS, start=1):
+        labels[np.linalg.norm(np.stack([x, y, z], axis=-1) - middle, axis=-1) < 20.0] = number
+    return labels
+
+
+def organ_case(folder, labels, region="other"):
+    """A case that avoids them all, by 3 mm."""
+    folder.mkdir()
+    image = sitk.GetImageFromArray(labels)
+    image.SetSpacing([STEP_MM] * 3)
+    image.SetOrigin([-99.0] * 3)
+    listed = [n for n in range(1, len(ORGANS) + 1) if (labels == n).any()]
+    avoided = [structure(f"o{n}", "avoid", {"labelmap": "labels.nrrd", "label": n}, margin_mm=3.0) for n in listed]
+    search = "theta_deg = [0, 180]\nstep_deg = 6.0"
+    write_case(folder, text=case_text(SKIN, ORGAN, *avoided, search=search, region=region))
+    sitk.WriteImage(image, str(folder / "labels.nrrd"))
+    return folder / "case.toml"
+
+
+@pytest.fixture(scope="module")
+def of_all_organs(tmp_path_factory):
+    found = prepare(organ_case(tmp_path_factory.mktemp("map") / "whole", organs()), arm=False).search()
+    assert "beyond_labels" not in found.verdict.structure, "round organs end round"
+    return found.safe
+
+
+BLANKED = [np.s_[:, :, 74:], np.s_[:, :, :26], np.s_[:, 74:], np.s_[66:], np.s_[:32]]
+
+
+@pytest.mark.parametrize("lost", BLANKED)
+def test_what_was_unsafe_is_never_safe_where_zeros_were_laid_over_a_part_of_the_map(tmp_path, of_all_organs, lost):
+    """A map of a cropped CT, laid back on the whole grid: its labels end flat, and the body beyond them is unknown."""
+    labels = organs()
+    labels[lost] = 0
+    context = prepare(organ_case(tmp_path / "blanked", labels), arm=False)
+    assert any("flat ends in one plane:" in said for said in context.anatomy.warnings)
+    found = context.search()
+    assert not (found.safe & ~of_all_organs).any()
+    assert 0 < found.safe.sum() < of_all_organs.sum()
+    newly = found.verdict.reason[of_all_organs & ~found.safe]
+    assert (newly == "unknown_region").all()
+
+
+def test_labels_that_end_flat_are_not_cut_where_another_label_lies_beyond_or_in_a_phantom(tmp_path, of_all_organs):
+    labels = organs()
+    labels[:, :, 74:] = 0
+    labels[50, 50, 95] = len(ORGANS) + 1  # of anything
+    for name, region, lost in (("beyond", "other", []), ("rods", "phantom", np.s_[:, :, 95:])):
+        labels[lost] = 0
+        context = prepare(organ_case(tmp_path / name, labels, region), arm=False)
+        assert "beyond_labels" not in [one.name for one in context.anatomy.structures]
+
+
+def test_a_target_where_the_labels_were_blanked_is_refused(tmp_path):
+    labels = organs()
+    labels[:, :, :60] = 0
+    with refused("labels_end", "flat ends in one plane:"):
+        prepare(organ_case(tmp_path / "blanked", labels), arm=False)
+
+
+REAL_MAPS = [
+    *(REAL_CT / f"labels_{name}.nii.gz" for name in ("v1_normal", "v2_fast")),
+    DATA / "slicer_chest_ct4" / "Segmentation.seg.nrrd",
+]
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the real label maps are not on this machine")
+@pytest.mark.parametrize("file", REAL_MAPS, ids=lambda file: file.name)
+def test_where_real_labels_were_blanked_is_known_and_nowhere_else(file):
+    """Behind planes across each axis; and of 2 to all labels of the map, drawn 500 times, as nobody cut them."""
+    labels = labelmap_of(read_volume(file))
+    whole, known, sides = label_ends(labels), 0, 0
+    for axis, end in np.ndindex(3, 2):
+        for at in range(whole.last[:, axis, 0].min() + 4, whole.last[:, axis, 1].max() - 3, 8):
+            kept = labels.labels.copy()
+            kept.swapaxes(0, axis)[slice(at, None) if end else slice(at)] = 0
+            ends = label_ends(replace(labels, labels=kept))
+            planes, flat = cut_off(ends, ends.last)
+            known, sides = known + (flat[end, axis] > 0 and planes[end, axis] == at - 0.5), sides + 1
+    assert known >= 0.95 * sides > 0
+    rng, called, sides = np.random.default_rng(1), 0, 0
+    inside = np.array(labels.labels.shape) - 1.0
+    last, flat_mm2 = whole.last.transpose(0, 2, 1), whole.flat_mm2.transpose(0, 2, 1)
+    planes, flat = cut_off(whole, whole.last)
+    assert not flat[(planes > 0.0) & (planes < inside)].any()
+    assert flat_mm2[(last > 0) & (last < inside)].max() < 0.3 * ORGAN_MM2
+    for _ in range(500):
+        some = rng.choice(len(whole.last), rng.integers(2, len(whole.last) + 1), replace=False)
+        planes, flat = cut_off(LabelEnds(whole.last[some], whole.flat_mm2[some]), whole.last[some])
+        within = (planes > 0.0) & (planes < inside)
+        called, sides = called + np.count_nonzero(flat[within]), sides + np.count_nonzero(within)
+    assert called <= 0.01 * sides

@@ -91,6 +91,12 @@ def refuse_label_map(mask: LabelMap) -> None:
         refuse(what, mask.path, allowed, "not_a_mask")
 
 
+def on_one_grid(one: VolumeGrid, other: VolumeGrid) -> bool:
+    """Whether two volumes have the same voxels in the same place."""
+    same_place = corner_deviation_mm(one.T_ct_index, other.T_ct_index, one.shape) <= SAME_PLACE_MM
+    return one.shape == other.shape and same_place
+
+
 def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> None:
     """Refuse masks of a folder on two grids: what lies beyond the smaller one would count as free."""
     (first, grid), *others = headers.items()

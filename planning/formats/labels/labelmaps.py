@@ -37,6 +37,7 @@ from puncture_twin.planning.formats.dicom.named_masks import unique_names
 from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.parts import slice_counts
 from puncture_twin.planning.geometry.rigid import apply
 
 MAX_LABEL = 65_535
@@ -46,7 +47,16 @@ ROUNDED_BY = 0.02
 """So far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
 LEAST_WHOLE = 0.15
 """Fraction of voxels besides the background: a blended map is whole inside its labels, an image in 4 % by chance."""
+FLAT, NEAR_MM, SPECK_MM2 = 0.5, 20.0, 100.0
+"""A label ends flat where its outermost slice is so much of its largest slice so near, and is no speck."""
 Box = tuple[slice, slice, slice]
+
+
+class LabelEnds(NamedTuple):
+    """Where each of n labels ends along each axis of its file, at the low and the high end."""
+
+    last: NDArray[np.int64]  # shape (n, 3, 2), its first and last slice
+    flat_mm2: NDArray[np.float64]  # shape (n, 3, 2), the area of that slice where the label ends flat, else 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +84,20 @@ class LabelMap:
     def labels_present(self) -> tuple[int, ...]:
         """The labels that at least one voxel has, rising, without the background."""
         return tuple(self.boxes)
+
+
+def label_ends(labelmap: LabelMap) -> LabelEnds:
+    """Where the labels present end, and where flat: as what was cut does; organs end round."""
+    spacing_mm, boxes = np.linalg.norm(labelmap.T_ct_index[:3, :3], axis=0), labelmap.boxes
+    last = np.array([[[at.start, at.stop - 1] for at in box] for box in boxes.values()], np.int64).reshape(-1, 3, 2)
+    flat_mm2 = np.zeros(last.shape)
+    for (label, box), of_label in zip(boxes.items(), flat_mm2, strict=True):
+        for axis, counts in enumerate(slice_counts(labelmap.labels[box] == label)):
+            near = 1 + round(NEAR_MM / spacing_mm[axis])
+            areas_mm2 = counts * np.prod(np.delete(spacing_mm, axis))
+            inward = areas_mm2[:near], areas_mm2[::-1][:near]
+            of_label[axis] = [one[0] if one[0] >= max(SPECK_MM2, FLAT * one.max()) else 0.0 for one in inward]
+    return LabelEnds(last, flat_mm2)
 
 
 def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
