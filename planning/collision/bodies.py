@@ -26,6 +26,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.collision.kernels.surfaces import boxes_near, points_within
 from puncture_twin.planning.collision.spheres import prism
 from puncture_twin.planning.collision.state_checker import PATIENT, Contact
 from puncture_twin.planning.geometry.kd_order import kd_order
@@ -193,13 +194,14 @@ class LooseParts(NamedTuple):
 
     corners: Floats  # shape (k, 3), mm: a corner of each
     sizes: Floats  # shape (k, 3), mm: the edges of the box about each
+    lengths: Floats  # shape (k,), mm: the diagonal of that box
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> LooseParts:
         """The connected parts of a checked mesh."""
         points, begins = _in_parts(mesh)
         sizes = np.maximum.reduceat(points, begins) - np.minimum.reduceat(points, begins)
-        return cls(points[begins], sizes)
+        return cls(points[begins], sizes, np.linalg.norm(sizes, axis=1))
 
 
 def connected_parts(mesh: TriangleMesh) -> list[Floats]:
@@ -272,20 +274,20 @@ class FclSkin:
 
         Of a link FCL sees the surface, which such a part does not touch. Holder and needle are solid for it.
         """
-        pose = body.full.surface.pose
-        if not body.hollow or not self._near(pose, body.box):
+        if not body.hollow:
             return False
-        small = np.linalg.norm(self._loose.sizes, axis=1) <= float(np.linalg.norm(body.box[1] - body.box[0]))
-        points = (self._loose.corners[small] - pose.getTranslation()) @ pose.getRotation()
-        near = np.all((points >= body.box[0]) & (points <= body.box[1]), axis=1)
-        return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
+        loose, stands = self._loose, body.full.surface.pose
+        R, t, near = stands.getRotation(), stands.getTranslation(), np.empty(len(loose.corners), np.bool_)
+        if not points_within(loose.corners, R, t, *body.box, near):
+            return False
+        near &= loose.lengths <= float(np.linalg.norm(body.box[1] - body.box[0]))
+        return bool(within((loose.corners[near] - t) @ R, body.half_spaces).any())
 
     def _near(self, pose: fcl.Transform, box: Floats) -> list[int]:
         """Parts of the surface that a box about a body, in the body's frame, may touch."""
-        R = pose.getRotation()
-        centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
-        reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
-        near = np.all((self._bounds[:, 1] >= centre - reach) & (self._bounds[:, 0] <= centre + reach), axis=1)
+        (lows, highs), near = self._bounds, np.empty(len(self._parts), np.bool_)
+        if not boxes_near(lows, highs, pose.getRotation(), pose.getTranslation(), *box, ROUNDING_MM, near):
+            return []
         found: list[int] = np.flatnonzero(near).tolist()
         return found
 
@@ -299,8 +301,9 @@ class FclSkin:
         return np.split(order, range(PART_TRIANGLES, len(order), PART_TRIANGLES))
 
     @cached_property
-    def _bounds(self) -> Floats:
-        return np.array([box_of(self._mesh.triangles[part].reshape(-1, 3)) for part in self._parts])
+    def _bounds(self) -> tuple[Floats, Floats]:
+        boxes = np.array([box_of(self._mesh.triangles[part].reshape(-1, 3)) for part in self._parts])
+        return np.ascontiguousarray(boxes[:, 0]), np.ascontiguousarray(boxes[:, 1])
 
     def _tree(self, part: int) -> fcl.CollisionObject:
         if part not in self._trees:

@@ -110,9 +110,8 @@ class FastChecker(CellChecker):
         path = np.asarray(q_path, dtype=np.float64)
         require_finite(path)
         motion, mask = self.motion(path), self._masks[needle_may_touch_patient]
-        for index, check in self._proofs.unproven(motion, mask):
-            frames = motion.frames[index]
-            contact = self._contact_of(check, self._proofs.settled_at(check, frames), frames)
+        for index, check, answer in self._proofs.not_clear(motion, mask):
+            contact = self._contact_of(check, answer, motion.frames[index])
             if contact is not None:
                 return FirstContact(index, contact)
         return None

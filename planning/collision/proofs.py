@@ -140,9 +140,15 @@ class Proofs:
         )
         return found
 
-    def settled_at(self, check: int, frames: Floats) -> int:
-        """Result of a check at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
-        return int(settled_kernels.settled_at(self.scene, self._work, self._on_triangle, check, frames))
+    def not_clear(self, motion: Motion, tested: Bools) -> Iterator[tuple[int, int, int]]:
+        """The states of a path, each with the checks, in order, that are not proven clear there, and their results.
+
+        Of the ``tested`` (k,) ones; results are those of :mod:`puncture_twin.planning.collision.kernels.settled`.
+        """
+        arguments = (self.scene, self._levers, tuple(motion), self._work, self._on_triangle)
+        due = np.zeros(len(self), np.int64)
+        while (found := settled_kernels.next_not_clear(*arguments, due, tested))[0] >= 0:
+            yield *divmod(int(found[0]), len(self)), int(found[1])
 
     def clear_about(self, frames: Floats, rotations: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.

@@ -16,7 +16,14 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, Hulls, deep, distance_bounds
-from puncture_twin.planning.collision.kernels.proofs import MIN_GAP_MM, SKIN, near_gap, place_spheres, state_gap
+from puncture_twin.planning.collision.kernels.proofs import (
+    MIN_GAP_MM,
+    SKIN,
+    first_unproven,
+    near_gap,
+    place_spheres,
+    state_gap,
+)
 
 CLEAR, OPEN, TOUCHES, TOUCHES_OUTSIDE = 0, 1, 2, 3
 """Results of a check: no contact; undecided, FCL is to be queried; a contact; a contact with what the CT shows outside
@@ -251,6 +258,22 @@ def settled_at(scene, work, scratch, at, frames):
     """Result of one check, the arm at ``frames`` (7, 4, 4): by its bound, else by `settled`."""
     gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
     return CLEAR if gap > MIN_GAP_MM else settled(scene, work, scratch, at, frames, gap)
+
+
+@allocation_free()
+def next_not_clear(scene, levers, motion, work, scratch, due, tested):
+    """The next state and check of a motion that are not proven clear, and the result of that check.
+
+    The arguments are those of `first_unproven`; a further call goes on from there. Returns state * k + check, -1 where
+    all that is left is clear, and the result.
+    """
+    while True:
+        at = first_unproven(scene, levers, motion, work, due, tested, MIN_GAP_MM)
+        if at < 0:
+            return at, CLEAR
+        answer = settled_at(scene, work, scratch, at % len(due), motion[0][at // len(due)])
+        if answer != CLEAR:
+            return at, answer
 
 
 @allocation_free()

@@ -31,6 +31,44 @@ def _to_box(low, high, x, y, z):
 
 
 @allocation_free()
+def boxes_near(lows, highs, R, t, low, high, slack, near):
+    """Whether each of some boxes, ``lows`` and ``highs`` (n, 3), meets the box about a body: ``near`` (n,), filled.
+
+    The body's box, from ``low`` to ``high`` (3,) in its own frame, stands at ``R`` (3, 3) and ``t`` (3,); the box about
+    it has the axes of the others, and is ``slack`` wider on each side. Returns whether any does.
+    """
+    found = False
+    for row in range(len(lows)):
+        near[row] = True
+        for i in range(3):
+            middle, reach = t[i], slack
+            for k in range(3):
+                middle += R[i, k] * 0.5 * (low[k] + high[k])
+                reach += abs(R[i, k]) * 0.5 * (high[k] - low[k])
+            if highs[row, i] < middle - reach or lows[row, i] > middle + reach:
+                near[row] = False
+                break
+        found = found or near[row]
+    return found
+
+
+@allocation_free()
+def points_within(points, R, t, low, high, within):
+    """Whether each of some points (n, 3) lies in a body's box, see `boxes_near`: ``within`` (n,), filled; if any."""
+    found = False
+    for row in range(len(points)):
+        within[row] = True
+        x, y, z = points[row, 0] - t[0], points[row, 1] - t[1], points[row, 2] - t[2]
+        for k in range(3):
+            at = x * R[0, k] + y * R[1, k] + z * R[2, k]
+            if at < low[k] or at > high[k]:
+                within[row] = False
+                break
+        found = found or within[row]
+    return found
+
+
+@allocation_free()
 def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop, fraction):
     """Distance of a point to a surface in a :class:`TriangleTree`, or ``cutoff`` where it is no nearer.
 
