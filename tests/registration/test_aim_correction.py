@@ -146,30 +146,22 @@ def test_a_case_corrects_for_what_it_states(tmp_path):
     np.testing.assert_array_equal(other.aim.arm_jacobian, J[0])
 
 
+def without_joints(text):
+    return "\n".join(",".join(line.split(",")[:4]) for line in text.splitlines()) + "\n"
+
+
 @pytest.mark.parametrize(
-    ("lines", "match"),
+    ("lines", "options", "code"),
     [
-        (['method = "rigid"', "correct = true"], "conflicting_keys"),
-        (['method = "triad"', "correct = true"], "conflicting_keys"),
-        (["correct_joints_deg = [0, 0, 0, 0, 0, 0]"], "keys_together"),
-        (["correct = true", "correct_joints_deg = [0, 0, 0, 0, 0, 0]"], "aim_beside_target"),
-        (["correct = 1"], "bad_value"),
+        (['method = "rigid"', "correct = true"], {}, "conflicting_keys"),
+        (['method = "triad"', "correct = true"], {}, "conflicting_keys"),
+        (["correct_joints_deg = [0, 0, 0, 0, 0, 0]"], {}, "keys_together"),
+        (["correct = true", "correct_joints_deg = [0, 0, 0, 0, 0, 0]"], {}, "aim_beside_target"),
+        (["correct = 1"], {}, "bad_value"),
+        (["correct = true"], {"errors": False}, "missing_errors"),
+        (["correct = true"], {"touch": without_joints}, "no_touch_joints"),
     ],
 )
-def test_what_contradicts_it_is_refused(tmp_path, lines, match):
-    with refused(match):
-        load_placement(changed_case(tmp_path, *lines))
-
-
-def test_it_needs_declared_errors(tmp_path):
-    with refused("missing_errors", "registration.correct"):
-        changed_case(tmp_path, "correct = true", errors=False)
-
-
-def test_it_needs_the_joints_of_the_touches(tmp_path):
-    def without_joints(text):
-        return "\n".join(",".join(line.split(",")[:4]) for line in text.splitlines()) + "\n"
-
-    case = changed_case(tmp_path, "correct = true", touch=without_joints)
-    with refused("no_touch_joints"):
-        load_placement(case)
+def test_what_contradicts_it_and_what_it_needs_is_refused(tmp_path, lines, options, code):
+    with refused(code):
+        load_placement(changed_case(tmp_path, *lines, **options))

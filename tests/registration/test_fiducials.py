@@ -7,7 +7,7 @@ from places import DATA, REAL_CT
 from refusals import refused
 
 from benchmarks.markers import counted, scene as benchmark_scene
-from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
 from puncture_twin.planning.geometry.rigid import exp_rotation
@@ -197,30 +197,32 @@ def test_a_layout_names_them_in_any_order_and_frame(seed):
     assert np.allclose([one.position_ct for one in named], points[: len(shown)])
 
 
-def test_a_mirrored_layout_is_refused():
-    """Its distances are the same, and its names would be wrong; a flat one has no handedness, and names them."""
-    mirror = np.diag([1.0, 1.0, -1.0])
-    seen = fiducials(moved(LAYOUT, np.random.default_rng(1)))
-    with refused("markers_mirrored"):
-        named_by_layout(seen, NamedPoints(NAMES, LAYOUT @ mirror, None), "layout")
+SQUARE = np.array([[0.0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0]])
+ZIGZAG = np.array([[0.0, 0, 0], [40, 20, 0], [90, 0, 0], [130, 20, 0], [180, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("shown", "layout", "code", "by"),
+    [
+        (LAYOUT, LAYOUT * [1, 1, -1], "markers_mirrored", InputError),
+        (SQUARE, SQUARE, "markers_ambiguous", NoAnswerError),
+        (ZIGZAG, ZIGZAG[:3], "markers_ambiguous", NoAnswerError),
+        (1.2 * LAYOUT, LAYOUT, "layout_not_seen", NoAnswerError),
+        (LAYOUT[:3], LAYOUT, "layout_not_seen", NoAnswerError),
+    ],
+)
+def test_a_layout_that_does_not_fit_once_is_refused(shown, layout, code, by):
+    """Eight ways of a square; three of a chain of equal steps are the first or the last; mirrored names are wrong."""
+    seen = fiducials(moved(shown, np.random.default_rng(1)))
+    with refused(code, by=by):
+        named_by_layout(seen, NamedPoints(NAMES[: len(layout)], layout, None), "layout")
+
+
+def test_a_flat_layout_has_no_handedness():
     flat = LAYOUT * [1.0, 1.0, 0.0]
-    named = named_by_layout(
-        fiducials(moved(flat, np.random.default_rng(2))),
-        NamedPoints(NAMES, flat @ np.diag([-1.0, 1, 1]), None),
-        "layout",
-    )
+    layout = NamedPoints(NAMES, flat * [-1, 1, 1], None)
+    named = named_by_layout(fiducials(moved(flat, np.random.default_rng(2))), layout, "layout")
     assert [one.name for one in named] == list(NAMES)
-
-
-def test_a_layout_that_fits_in_two_ways_is_not_guessed():
-    """A square has eight; three of a chain of equal steps may be the first three or the last three."""
-    rng = np.random.default_rng(3)
-    square = np.array([[0.0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0]])
-    with refused("markers_ambiguous", by=NoAnswerError):
-        named_by_layout(fiducials(moved(square, rng)), NamedPoints(tuple("ABCD"), square, None), "layout")
-    zigzag = np.array([[0.0, 0, 0], [40, 20, 0], [90, 0, 0], [130, 20, 0], [180, 0, 0]])
-    with refused("markers_ambiguous", by=NoAnswerError):
-        named_by_layout(fiducials(moved(zigzag, rng)), NamedPoints(tuple("ABC"), zigzag[:3], None), "layout")
 
 
 def test_a_layout_that_is_nearly_symmetric_never_names_them_wrong():
@@ -299,14 +301,6 @@ def test_things_alike_by_one_between_them_are_no_list():
     chain = [one for mm, k in ((8.0, 0), (8.5, 2), (9.0, 3)) for one in fiducials(LAYOUT[k : k + 2], diameter=mm)]
     with refused("markers_unclear", by=NoAnswerError):
         choose_fiducials(Seen(tuple(chain), ()), Stated(), where="test")
-
-
-def test_a_layout_of_other_distances_is_not_seen():
-    rng = np.random.default_rng(4)
-    with refused("layout_not_seen", by=NoAnswerError):
-        named_by_layout(fiducials(moved(1.2 * LAYOUT, rng)), NamedPoints(NAMES, LAYOUT, None), "layout")
-    with refused("layout_not_seen", by=NoAnswerError):
-        named_by_layout(fiducials(moved(LAYOUT[:3], rng)), NamedPoints(NAMES, LAYOUT, None), "layout")
 
 
 REAL = [REAL_CT / "ct.nii.gz", DATA / "slicer_chest_ct4" / "CTChest4.nrrd"]

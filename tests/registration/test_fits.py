@@ -1,18 +1,30 @@
-"""Each fit is the least of what it weighs, by SciPy; and what a registration says of its noise, by formula."""
+"""Each fit is the least of what it weighs, by SciPy; what is said of its noise, by formula; test and regions hold."""
 
 import numpy as np
 import pytest
 from refusals import refused
 from scipy.optimize import least_squares
+from scipy.special import chdtri
 from uncertainty_world import declared, world
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
-from puncture_twin.planning.registration.fits import ReadingNoise, fit_joint, fit_rigid, fit_triad, fit_weighted
+from puncture_twin.planning.registration.fits import (
+    ReadingNoise,
+    design,
+    differenced_map,
+    fit_joint,
+    fit_rigid,
+    fit_triad,
+    fit_weighted,
+    least_squares_map,
+)
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
 T_TRUE = pose(exp_rotation(np.array([0.4, -0.2, 1.1])), np.array([300.0, -200.0, 100.0]))
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20]])
+SIX = np.vstack([MARKERS, [[20, 150, 147], [0, 80, 60]]])
 TARGET = np.array([50.0, 130.0, 63.0])
 READ = (0.29, 0.29, 1.44)
 """Deviations of a reading along the CT's axes, mm."""
@@ -142,8 +154,12 @@ def test_what_is_said_of_declared_noise():
     agreed = register(pairs(0.3), method="weighted", target_ct=TARGET, noise=noise())
     assert agreed.fle_source == "[errors]"
     assert agreed.fle_interval_mm == (agreed.fle_mm, agreed.fle_mm)
+    with refused("residuals_too_large"):
+        register(pairs(4.0), method="weighted", target_ct=TARGET, noise=noise())
     beyond = register(pairs(4.0), method="weighted", target_ct=TARGET, noise=noise(), accept_residuals=True)
     test = beyond.uncertainty.test
+    assert test.scale > 2 and "residuals_unexplained" in [flag.code for flag in beyond.flags]
+
     assert beyond.fle_source == f"[errors], scaled by {test.scale:.2f} to the residuals"
     np.testing.assert_allclose(beyond.fle_interval_mm, beyond.fle_mm / test.scale * np.array(test.interval), rtol=1e-12)
     found = register(pairs(0.3), method="weighted", target_ct=TARGET, noise=noise(), noise_found=True)
@@ -164,3 +180,52 @@ def test_the_expected_error_at_a_point_has_the_noises_interval(told):
     if told is not None:
         shift = given.uncertainty.cov_at(apply(given.T_base_ct, TARGET))[:3, :3]
         assert expected[0] == pytest.approx(np.sqrt(np.trace(shift)))
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_the_statistic_is_chi_squared_and_its_regions_hold(count, rng):
+    """20,000 registrations: chi-squared at both tails; region by chi2 (known) and by F (found) 95 %, naive far less."""
+    read, touched, markers = np.array([0.29, 0.29, 1.44]), 0.35, SIX[:count]
+    cov_touched = np.tile(touched**2 * np.eye(3), (count, 1, 1))
+    told = ReadingNoise(np.diag(read**2), cov_touched, np.zeros((3 * count, 28)), np.zeros(28), True)
+    ct = markers + rng.normal(size=(20_000, *markers.shape)) * read
+    base = apply(T_TRUE, markers) + rng.normal(size=ct.shape) * touched
+    T = fit_weighted(ct, base, told, fit_rigid(ct, base))
+    omega = told.covariance(T_TRUE[:3, :3]).independent
+    fitted = apply(T_TRUE, markers)
+    A = design(fitted, fitted.mean(axis=0))
+    L = least_squares_map(A, np.linalg.inv(omega))
+    target = np.array([50.0, 130.0, 63.0])
+    error = T[:, :3, :3] @ target + T[:, :3, 3] - apply(T_TRUE, target)
+    X = np.concatenate([np.eye(3), -np.cross(np.eye(3), apply(T_TRUE, target) - fitted.mean(axis=0))], axis=1)
+    cov = X @ L @ omega @ L.T @ X.T
+    square = np.einsum("na,ab,nb->n", error, np.linalg.inv(cov), error)
+    residuals = base - (np.einsum("nab,nmb->nma", T[:, :3, :3], ct) + T[:, None, :3, 3])
+    tests = [noise_test(r.ravel(), omega, A) for r in residuals[:4000]]
+    assert np.mean([test.probability < 0.01 for test in tests]) == pytest.approx(0.01, abs=0.006)
+    assert np.mean([test.probability > 0.9 for test in tests]) == pytest.approx(0.1, abs=0.02)
+    assert np.mean(square <= chdtri(3, 0.05)) == pytest.approx(0.95, abs=0.006)
+    s = np.array([test.estimate for test in tests])
+    factor = NoiseTest(count, 1.0, found=True).region_factor
+    assert np.mean(square[:4000] <= (s * factor) ** 2) == pytest.approx(0.95, abs=0.012)
+    assert np.mean(square[:4000] <= s**2 * chdtri(3, 0.05)) < {3: 0.82, 6: 0.925}[count]
+    held = [test.interval.low <= 1 <= test.interval.high for test in tests]
+    assert np.mean(held) == pytest.approx(0.95, abs=0.012)
+
+
+@pytest.mark.parametrize(
+    ("count", "low", "high", "factor"),
+    [(3, 0.57, 3.73, 5.28), (4, 0.64, 2.20, 3.78), (5, 0.69, 1.83, 3.40), (6, 0.72, 1.65, 3.24)],
+)
+def test_interval_and_region_of_an_estimated_size(count, low, high, factor):
+    test = NoiseTest(count, float(3 * count - 6), found=True)
+    assert test.estimate == pytest.approx(1.0)
+    np.testing.assert_allclose(test.interval, (low, high), atol=0.006)
+    assert test.region_factor == pytest.approx(factor, abs=0.006)
+
+
+def test_a_method_without_a_formula_is_differenced():
+    base = apply(T_TRUE, SIX)
+    np.testing.assert_allclose(
+        differenced_map(fit_rigid, SIX, base), least_squares_map(design(base, base.mean(axis=0))), atol=1e-6
+    )

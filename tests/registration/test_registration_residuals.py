@@ -1,4 +1,4 @@
-"""Residuals against the noise: what honest noise leaves passes, more is refused, and no estimated noise is zero."""
+"""Residuals against the noise: honest noise passes, more is refused, none is zero; the marker that misses is named."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,18 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.method import rigid_rss
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import MIN_FLE_MM, REJECT_LEVEL, ResidualTest
+from puncture_twin.planning.registration.residuals import (
+    FALSE_ALARM,
+    MIN_FLE_MM,
+    REJECT_LEVEL,
+    ResidualTest,
+    outlier_marker,
+)
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2
 
 TARGET = np.array([50.0, 130.0, 63.0])
@@ -124,3 +130,54 @@ def test_no_residual_is_no_error_of_zero(count):
     assert "floor" in found.fle_source
     assert found.expected_tre_mm(TARGET[None])[0] > 0.1
     assert found.expected_tre_interval_mm(TARGET).high > found.expected_tre_mm(TARGET[None])[0]
+
+
+TURN = np.array([0.3, -0.2, 1.0])
+T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [300.0, -50.0, 100.0])
+PLACES = np.array([[0, 0, 80], [60, 10, 75], [0, 70, 60], [-50, -40, 65], [40, -60, 70], [-70, 30, 50]], dtype=float)
+NAMES = ("A", "navel", "C", "D", "left rib", "F")
+
+
+def markers(seed, noise_mm=0.4, moved=None, by_mm=0.0):
+    """Six markers, each axis read with this noise; one of them moved."""
+    rng = np.random.default_rng(seed)
+    base = apply(T_BASE_CT, PLACES) + rng.normal(0.0, noise_mm, PLACES.shape)
+    if moved is not None:
+        base[moved] += by_mm * np.array([0.6, 0.0, 0.8])
+    return MarkerPairs(NAMES, PLACES, base)
+
+
+@pytest.mark.parametrize("moved", range(6))
+def test_a_marker_that_slipped_is_called_by_its_name(moved):
+    """A residual of some 4 mm among five below 1.5: named, with how far the others place it from its reading."""
+    pairs = markers(3, moved=moved, by_mm=8.0)
+    found = register(pairs, method="rigid", target_ct=TARGET)
+    (said,) = [flag.sentence for flag in found.flags if flag.code == "outlier_marker"]
+    assert said.startswith(f"marker {NAMES[moved]} does not fit: the other 5 place it")
+    told = outlier_marker(pairs, None)
+    rest = [row for row in range(6) if row != moved]
+    T = fit_rigid(PLACES[rest], pairs.points_base[rest])
+    miss = np.linalg.norm(apply(T, PLACES[moved : moved + 1])[0] - pairs.points_base[moved])
+    assert told.miss_mm == pytest.approx(miss) and miss > 1.2 * found.residual_mm[moved]
+
+
+def test_honest_markers_are_called_odd_as_often_as_is_said():
+    """In 400 honest sets about the stated one in a hundred, by the spread of such a count."""
+    count = 400
+    alarms = sum(outlier_marker(markers(seed, noise_mm=1.0), None) is not None for seed in range(count))
+    assert 1 <= alarms <= count * FALSE_ALARM + 4 * np.sqrt(count * FALSE_ALARM)
+
+
+def test_a_declared_noise_that_explains_it_is_held():
+    """What is odd among good readings is none where readings are declared to err as much."""
+    pairs = markers(5, noise_mm=0.2, moved=2, by_mm=4.0)
+    assert outlier_marker(pairs, None).name == "C" and outlier_marker(pairs, 3.0) is None
+
+
+def test_tiny_residuals_and_few_markers_name_nobody():
+    """Below the floor of the noise everything is luck; of three none can be told; a row places nothing."""
+    assert outlier_marker(markers(1, noise_mm=0.0, moved=1, by_mm=0.3), None) is None
+    pairs = markers(1, moved=1, by_mm=8.0)
+    assert outlier_marker(MarkerPairs(NAMES[:3], pairs.points_ct[:3], pairs.points_base[:3]), None) is None
+    row = np.array([[0.0, 0, 0], [50, 0, 0], [100, 0, 0], [40, 80, 0]])
+    assert outlier_marker(MarkerPairs(NAMES[:4], row, row + [0, 0, 1.0]), None) is None
