@@ -136,10 +136,6 @@ def shorter(slices):
 
 REFUSED = {
     "one slice": (lambda: world.series()[:1], "too_few_slices"),
-    "missing slice": (
-        lambda: world.series(world.phantom((7, 5, 6)))[:3] + world.series(world.phantom((7, 5, 6)))[4:],
-        "uneven_slices 2.5",
-    ),
     "twelve slices missing": (  # beside them each true step was less than a tenth of the largest one
         lambda: world.series(world.phantom((7, 5, 24)))[:10] + world.series(world.phantom((7, 5, 24)))[22:],
         "uneven_slices 12",

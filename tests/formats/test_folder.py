@@ -22,15 +22,8 @@ from puncture_twin.planning.init.segmentation import Place
 HARMLESS = (
     *("statistics.json", "preview_total.png", ".DS_Store", "._liver.nii.gz", "README.md", "liver.nii.gz.dvc"),
     *("liver.json", "markers.csv", "case.toml", ".gitattributes", "report.html", "view.PNG", "scene.mrml"),
-    *(
-        "predict_from_raw_data_args.json",
-        "postprocessing.pkl",
-        "liver.npz",
-        "colon.pkl",
-        "liver.nii.gz.txt",
-        "SHA256SUMS",
-    ),
-    *(".nfs0000a1", ".~lock.notes.odt#"),
+    *("predict_from_raw_data_args.json", "postprocessing.pkl", "liver.npz", "colon.pkl", "liver.nii.gz.txt"),
+    *(".nfs0000a1", ".~lock.notes.odt#", "SHA256SUMS"),
 )
 LOST = (
     *("vessel.npz", "vessel.nii.gz.part", "vessel.nii.zst", "vessel.mha", "vessel.stl", "vessel.dcm", "vessel"),

@@ -21,10 +21,6 @@ SQUARE = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [10.0, 10.0, 0.0], [0.0, 10.0, 0.0]
 TWO = [[0, 1, 2], [0, 2, 3]]
 
 
-def with_value(value: float) -> list[list[float]]:
-    return [*SQUARE[:3], [value, 10.0, 0.0]]
-
-
 def rigid(**changes: float) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
@@ -57,22 +53,16 @@ def test_a_good_mesh_comes_back_as_it_was_and_read_only() -> None:
     [
         pytest.param([], TWO, "empty", id="no-vertex"),
         pytest.param(SQUARE, [], "empty", id="no-triangle"),
-        pytest.param(with_value(np.nan), TWO, "not_finite", id="nan-vertex"),
         pytest.param([*SQUARE, [np.nan] * 3], TWO, "not_finite", id="nan-in-an-unused-vertex"),
         pytest.param(SQUARE, [[0, 1, 4]], "index_out_of_range", id="index-too-high"),
         pytest.param(SQUARE, [[0, 1, 2], [0, -1, 2]], "index_out_of_range -1", id="index-negative"),
         pytest.param(SQUARE, [[0, 1, 2**32]], "index_out_of_range", id="index-that-int32-would-wrap-to-0"),
         pytest.param(SQUARE, [[0, 1, 1.5]], "not_whole", id="index-with-a-fraction"),
         pytest.param(SQUARE, [[0, 1, np.nan]], "not_whole", id="index-nan"),
-        pytest.param(SQUARE, [["0", "1", "2"]], "not_whole", id="index-of-text"),
         pytest.param(SQUARE, [[0, 1, 2, 3]], "wrong_shape", id="quads"),
         pytest.param(SQUARE, [[0, 1, 2], [0, 1]], "wrong_shape", id="faces-ragged"),
         pytest.param([[0.0, 0.0], [1.0, 1.0]], TWO, "wrong_shape", id="vertices-in-2d"),
-        pytest.param([["a", "b", "c"]], TWO, "wrong_type", id="vertices-of-text"),
         pytest.param(np.array(SQUARE) * 1j, TWO, "wrong_type", id="vertices-complex"),
-        pytest.param(np.array(SQUARE) / 1000, TWO, "implausible_size", id="metres-declared-as-mm"),
-        pytest.param(np.array(SQUARE) * 1000, TWO, "implausible_size", id="mm-declared-as-m"),
-        pytest.param(np.array(SQUARE) + 1e6, TWO, "too_far", id="far-from-the-origin"),
         pytest.param([[0, 0, 0], [1, 1, 1], [9, 9, 9]], [[0, 1, 2]], "no_area", id="all-on-a-line"),
         pytest.param(SQUARE, [[0, 0, 1], [2, 2, 2]], "no_area", id="no-area"),
     ],
@@ -100,11 +90,9 @@ def test_the_limits_of_size_are_the_stated_ones() -> None:
         pytest.param(np.eye(3), "wrong_shape", id="3x3"),
         pytest.param(np.full((4, 4), "1"), "wrong_type", id="text"),
         pytest.param(rigid(m03=np.nan), "not_finite", id="nan"),
-        pytest.param(np.zeros((4, 4)), "not_rigid", id="zero"),
         pytest.param(rigid(m30=0.1), "not_rigid", id="projective"),
         pytest.param(rigid(m33=2.0), "not_rigid", id="scaled-by-the-last-entry"),
         pytest.param(np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrored", id="mirrored"),
-        pytest.param(np.diag([1000.0, 1000.0, 1000.0, 1.0]), "not_rigid", id="metres-to-mm"),
         pytest.param(np.diag([2.0, 0.5, 1.0, 1.0]), "not_rigid", id="sheared-with-determinant-1"),
         pytest.param(rigid(m03=2e5), "too_far", id="far-away"),
     ],

@@ -56,15 +56,6 @@ def test_one_voxel_is_an_octahedron_around_its_centre() -> None:
     assert volume_of(mesh) == pytest.approx(6.0 / 6.0)
 
 
-def test_a_box_has_its_faces_where_its_voxels_end() -> None:
-    """A box of voxels that touches the border of the map is closed on the outer faces of its voxels."""
-    labels = np.zeros((10, 10, 10), dtype=np.int32)
-    labels[0:6, 3:10, 2:8] = 1
-    mesh = label_mesh(map_of(labels, np.diag([1.0, 2.0, 3.0, 1.0])), 1, where="test")
-    assert np.allclose(mesh.bounds, [[-0.5, 5.0, 4.5], [5.5, 19.0, 22.5]], atol=1e-9)
-    assert mesh.closed
-
-
 def test_any_mask_makes_a_closed_manifold_surface_with_normals_outward() -> None:
     """Each edge has two triangles that run it in opposite directions; scikit-image's default fails this."""
     rng = np.random.default_rng(4)

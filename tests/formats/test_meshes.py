@@ -293,25 +293,20 @@ BROKEN = [
     ("any-empty-file", ".stl", b"", "file_size"),
     ("any-unknown-ending", ".step", STL, "unknown_format"),
     ("stl-header-cut", ".stl", STL[:50], "file_cut"),
-    ("stl-cut-in-the-middle", ".stl", STL[: len(STL) // 2], "size_mismatch 80 4084 2042"),
     ("stl-trailing-bytes", ".stl", STL + b"\0\0", "size_mismatch 4086"),
     ("stl-count-4-billion", ".stl", patched(STL, 80, b"\xff" * 4), "size_mismatch 4294967295"),
     ("stl-nan-vertex", ".stl", patched(STL, 84 + 12, NAN), "not_finite"),
     ("stl-all-zero", ".stl", patched(STL, 84, bytes(len(STL) - 84)), "implausible_size"),
-    ("stl-binary-garbage", ".stl", NOISE, "size_mismatch"),
     ("stl-ascii-without-end", ".stl", replaced(ASCII_STL, b"endsolid", b""), "file_cut"),
     ("stl-ascii-cut-but-closed", ".stl", ASCII_STL[:5000] + b"\nendsolid\n", "file_cut"),
     ("stl-ascii-misspelt", ".stl", replaced(ASCII_STL, b"vertex", b"vertx"), "unknown_line vertx"),
-    ("stl-ascii-facet-without-end", ".stl", replaced(ASCII_STL, b"endfacet", b""), "unknown_line"),
     ("stl-ascii-number-broken", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 1,5x"), "not_a_number"),
     ("stl-ascii-4-corners", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 0 0 0\nvertex "), "unknown_line"),
     ("stl-ascii-no-facet", ".stl", b"solid x facet\nendsolid x\n", "empty"),
     ("stl-ascii-two-solids", ".stl", ASCII_STL * 2, "several_solids"),
-    ("stl-ascii-endless-word", ".stl", replaced(ASCII_STL, b"normal", b"n" * 5000), "unknown_line"),
     ("ply-endless-word", ".ply", ply_text("0 " * 8 + "9" * 5000 + "\n3 0 1 2\n"), "word_too_long 5000"),
     ("stl-ascii-not-utf8", ".stl", replaced(ASCII_STL, b"loop", b"\xff\xfe"), "not_text"),
     ("obj-last-line-cut", ".obj", OBJ_CORNERS + b"f 1 2 3", "file_cut"),
-    ("obj-face-list-cut", ".obj", OBJ[: OBJ.index(b"\nf ") + 1], "empty"),
     ("obj-faces-cut", ".obj", OBJ[: OBJ.index(b"\n", OBJ.index(b"\nf ") + 99) + 1], "unused_vertices"),
     ("obj-fewer-than-counted", ".obj", OBJ_CORNERS + b"# Faces: 2\nf 1 2 3\n", "size_mismatch"),
     ("obj-endless-count", ".obj", OBJ_CORNERS + b"# Faces: " + b"9" * 5000 + b"\nf 1 2 3\n", "size_mismatch inf"),
@@ -329,7 +324,6 @@ BROKEN = [
     ("ply-cut-in-the-middle", ".ply", PLY[: len(PLY) // 2], "file_cut"),
     ("ply-header-cut", ".ply", PLY[:60], "bad_header"),
     ("ply-trailing-bytes", ".ply", PLY + b"xyz", "size_mismatch"),
-    ("ply-count-too-low", ".ply", replaced(PLY, b"face 80", b"face 79"), "size_mismatch 13"),
     ("ply-count-too-high", ".ply", replaced(PLY, b"face 80", b"face 81"), "file_cut"),
     ("ply-count-huge", ".ply", replaced(PLY, b"vertex 42", b"vertex 4294967295"), "file_cut 4294967295"),
     ("ply-count-beyond-reason", ".ply", replaced(PLY, b"vertex 42", b"vertex " + b"9" * 40), "bad_header"),
@@ -346,14 +340,10 @@ BROKEN = [
     ("ply-no-z", ".ply", replaced(ply_text(CORNERS + "3 0 1 2\n"), b"float z", b"float w"), "bad_header"),
     ("ply-unknown-type", ".ply", replaced(PLY, b"float x", b"quad x"), "unknown_type quad"),
     ("ply-unknown-format", ".ply", replaced(PLY, b"binary_little_endian", b"zipped"), "unsupported_feature zipped"),
-    ("ply-garbage", ".ply", NOISE, "bad_header"),
     ("glb-cut-in-the-middle", ".glb", GLB[: len(GLB) // 2], "size_mismatch"),
-    ("glb-header-cut", ".glb", GLB[:16], "wrong_format"),
     ("glb-chunk-too-long", ".glb", patched(GLB, 12, b"\xff\xff\xff\x7f"), "file_cut"),
     ("glb-version-1", ".glb", patched(GLB, 4, b"\1"), "wrong_format"),
-    ("glb-garbage", ".glb", NOISE, "wrong_format"),
     ("glb-json-broken", ".glb", patched(GLB, 20, b"x"), "not_json"),
-    ("glb-json-nested-without-end", ".glb", glb({}, b"").replace(b"{}", b"[["), "not_json"),
     ("glb-json-of-another-kind", ".glb", glb({"a": 1}, b""), "bad_value asset missing"),
     ("glb-mesh-without-node", ".glb", broken_glb(nodes=[{}]), "mesh_not_placed"),
     ("glb-mesh-outside-of-scene", ".glb", broken_glb(scenes=[{"nodes": []}]), "mesh_not_placed"),
@@ -411,7 +401,6 @@ BROKEN = [
     ("vtk-more-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 4"), "size_mismatch 18 12"),
     ("vtk-huge", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 999999999999"), "out_of_range 999999999999"),
     ("vtk-points-of-int", ".vtk", replaced(VTK, b"6 float", b"6 int"), "unknown_type"),
-    ("vtk-word", ".vtk", replaced(VTK, b"15 10", b"wide 1"), "not_a_number"),
     ("vtk-index-too-high", ".vtk", vtk_model(PENTAGON, [[0, 1, 6]]), "index_out_of_range"),
     ("vtk-two-corners", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [0, 1]]), "wrong_count"),
     ("vtk-cells-too-many", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 4 15"), "file_cut"),
@@ -445,21 +434,19 @@ def test_a_mesh_placed_too_often_is_refused_before_it_is_built(tmp_path: Path) -
         read(tmp_path, ".glb", glb(document, GLTF_BINARY))
 
 
-# ---- any bytes -----------------------------------------------------------------------------------------------------
+# ---- cut files -----------------------------------------------------------------------------------------------------
 
 
 def mesh_or_refusal(folder: Path, suffix: str, data: bytes) -> TriangleMesh | None:
     try:
-        mesh = read(folder, suffix, data)
+        return read(folder, suffix, data)
     except InputError:
         return None
-    guard_mesh(mesh.vertices, mesh.faces, where="again")
-    return mesh
 
 
 @pytest.mark.parametrize("kind", WHOLE)
-def test_cut_and_changed_bytes_give_a_refusal_or_a_guarded_mesh(tmp_path: Path, kind: str) -> None:
-    """Cut anywhere: refused, or nothing was lost. Up to four changed runs, or any bytes: no other exception."""
+def test_a_cut_file_is_refused_or_has_lost_nothing(tmp_path: Path, kind: str) -> None:
+    """Changed bytes are for the fuzzer."""
     random = Random(kind)
     suffix, whole = WHOLE[kind]
     for _ in range(40):
@@ -468,13 +455,6 @@ def test_cut_and_changed_bytes_give_a_refusal_or_a_guarded_mesh(tmp_path: Path, 
             cut = cut[:-1]
         mesh = mesh_or_refusal(tmp_path, suffix, cut)
         assert mesh is None or same_triangles(mesh, BALL.triangles)
-        changed = whole
-        for _ in range(random.randint(1, 4)):
-            position = random.randint(0, min(len(whole), 2500))
-            words = [random.randbytes(random.randrange(5)), b"-1", b"9" * 9, b"nan", b"1e9", b"\n", b"\xff" * 4]
-            changed = changed[:position] + random.choice(words) + changed[position + random.randint(0, 4) :]
-        mesh_or_refusal(tmp_path, suffix, changed)
-        assert mesh_or_refusal(tmp_path, suffix, random.randbytes(random.randrange(200))) is None
 
 
 def test_an_obj_cut_at_a_line_end_is_open_where_it_is_not_refused(tmp_path: Path) -> None:
@@ -528,18 +508,7 @@ def test_what_is_kept_of_meshes_is_what_they_warn_of(tmp_path: Path, monkeypatch
     assert found == ["liver", "spleen", "aorta", "a", "liver", "spleen", "aorta"]
 
 
-needs_vh_male = pytest.mark.skipif(not VH_MALE.is_dir(), reason="the hubmap_vh_male set is not on this machine")
-
-
-@needs_vh_male
-def test_the_visible_human_skin_is_whole_and_watertight() -> None:
-    mesh = read_mesh(VH_MALE / "VH_M_Skin.v1.1.glb", unit=Unit.M, space=Space.LOCAL, up=Up.Z)
-    assert len(mesh.faces) == 107_334 and mesh.closed and mesh_warnings(mesh, "skin") == ()
-    litres = np.linalg.det(mesh.triangles).sum() / 6.0 / 1e6
-    assert litres == pytest.approx(96.22, abs=0.01)
-
-
-@needs_vh_male
+@pytest.mark.skipif(not VH_MALE.is_dir(), reason="the hubmap_vh_male set is not on this machine")
 def test_all_visible_human_organs_read_as_trimesh_reads_them() -> None:
     """Same number of triangles, same set of triangle centres with all node transforms applied, to 0.01 mm."""
     paths = sorted(VH_MALE.glob("*.glb"))
@@ -551,3 +520,5 @@ def test_all_visible_human_organs_read_as_trimesh_reads_them() -> None:
         ours, theirs = mesh.triangles.mean(axis=1), other.triangles.mean(axis=1) * 1000.0
         distance, _ = cKDTree(ours).query(theirs)
         assert distance.max() < 0.01, path.name
+        if "Skin" in path.name:
+            assert mesh.closed and mesh_warnings(mesh, "skin") == ()

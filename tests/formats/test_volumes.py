@@ -4,7 +4,6 @@ import gzip
 import itertools
 import struct
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.nifti_header import TYPES
 from puncture_twin.planning.formats.volumes.nrrd_header import TYPES as NRRD_TYPES
-from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, canonical, read_volume
+from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, read_volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
 
 SHAPE = (4, 5, 6)
@@ -74,6 +73,17 @@ def nrrd_bytes(*changes: tuple[str, str | None], data: bytes | None = None) -> b
     return ("\n".join(lines) + "\n\n").encode() + (VALUES.tobytes(order="F") if data is None else data)
 
 
+GZIP = ("encoding", "encoding: gzip")
+
+
+def axes(first_two: str) -> tuple[str, str]:
+    return "space directions", f"space directions: {first_two} (0,0,4)"
+
+
+def all_of(value: float) -> bytes:
+    return np.full(120, value, dtype="<f4").tobytes()
+
+
 def write(folder: Path, name: str, content: bytes) -> Path:
     path = folder / name
     path.write_bytes(content)
@@ -82,15 +92,6 @@ def write(folder: Path, name: str, content: bytes) -> Path:
 
 def place(T: np.ndarray, *index: float) -> list[float]:
     return list((T @ [*index, 1.0])[:3])
-
-
-def test_nifti_sform_is_turned_from_ras_to_lps(tmp_path: Path) -> None:
-    """Voxel (1, 2, 3) at RAS (12, 26, 42) lies at LPS (-12, -26, 42), and keeps its value."""
-    volume = read_volume(write(tmp_path, "a.nii", nifti_bytes()))
-    assert place(volume.T_ct_index, 1, 2, 3) == [-12.0, -26.0, 42.0]
-    assert np.array_equal(volume.values, VALUES)
-    assert not volume.values.flags.writeable
-    assert not volume.T_ct_index.flags.writeable
 
 
 def test_nifti_qform_with_a_quarter_turn_and_a_flip(tmp_path: Path) -> None:
@@ -141,6 +142,7 @@ def test_files_that_simpleitk_writes_come_back(tmp_path: Path) -> None:
         sitk.WriteImage(image, str(tmp_path / name), useCompression=name != "a.nii")
         volume = read_volume(tmp_path / name)
         assert np.array_equal(volume.values, VALUES)
+        assert not volume.values.flags.writeable and not volume.T_ct_index.flags.writeable
         for index in itertools.product((0, 3), (0, 4), (0, 5)):
             expected = image.TransformIndexToPhysicalPoint(index)
             assert np.allclose(place(volume.T_ct_index, *index), expected, atol=1e-3)
@@ -192,11 +194,10 @@ def test_nrrd_values_are_simpleitks_bit_for_bit(tmp_path: Path, order: str, name
     typed = (("type", f"type: {name}"), ("endian", f"endian: {order}"))
     write(tmp_path, "a b.raw", raw)
     write(tmp_path, "a.raw.gz", gzip.compress(raw))
-    packed = ("encoding", "encoding: gzip")
     contents = {
         "raw.nrrd": nrrd_bytes(*typed, data=raw),
-        "gzip.nrrd": nrrd_bytes(*typed, packed, data=gzip.compress(raw)),
-        "gzip.nhdr": nrrd_bytes(*typed, packed, ("data file", "data file: a.raw.gz"), data=b""),
+        "gzip.nrrd": nrrd_bytes(*typed, GZIP, data=gzip.compress(raw)),
+        "gzip.nhdr": nrrd_bytes(*typed, GZIP, ("data file", "data file: a.raw.gz"), data=b""),
         "raw.nhdr": nrrd_bytes(*typed, ("data file", "data file: a b.raw"), data=b""),
     }
     for file, content in contents.items():
@@ -216,17 +217,6 @@ def test_members_and_padding_of_gzip_data(tmp_path: Path) -> None:
             read_volume(write(tmp_path, "a.nii.gz", b"".join(cut) + end))
 
 
-def test_canonical_order_is_right_handed_and_keeps_places() -> None:
-    """Every voxel keeps its value and its place, for all 48 axis orders and flips of an oblique affine."""
-    T = np.eye(4)
-    T[:3, :3] = np.array([[0.8, 0.0, -0.6], [0.36, 0.8, 0.48], [0.48, -0.6, 0.64]]) * [1.0, 2.0, 3.0]
-    for order, flips in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
-        stored, T_stored = restored(VALUES, T, order, flips)
-        oriented = canonical(stored, T_stored)
-        assert np.array_equal(oriented.values, VALUES)
-        assert np.allclose(oriented.T_ct_index, T, atol=1e-12)
-
-
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
 def test_a_point_has_the_value_of_the_nearest_voxel(order: tuple[int, ...]) -> None:
     """However the voxels lie in memory; half way between two voxels it is the even one, outside there is none."""
@@ -241,19 +231,9 @@ def test_a_point_has_the_value_of_the_nearest_voxel(order: tuple[int, ...]) -> N
     assert np.isnan(nearest(values, np.eye(4), np.array([[np.nan, 1.0, 1.0], [np.inf, 1.0, 1.0]]))).all()
 
 
-def restored(values: np.ndarray, T: np.ndarray, order: tuple[int, ...], flips: tuple[int, ...]) -> tuple[Any, Any]:
-    T_new = np.zeros((4, 4))
-    T_new[3, 3] = 1
-    for new, old in enumerate(order):
-        T_new[old, new] = flips[new]
-        T_new[old, 3] = 0 if flips[new] == 1 else values.shape[old] - 1
-    return values.transpose(order)[tuple(slice(None, None, f) for f in flips)], T @ T_new
-
-
 NAN = float("nan")
 WHOLE = nifti_bytes()
 PACKED = gzip.compress(WHOLE)
-Q = {"codes": (1, 0)}
 BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     "empty": ("a.nii", b"", "file_size"),
     "cut in the header": ("a.nii", WHOLE[:200], "file_cut"),
@@ -270,41 +250,28 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     "colour": ("a.nii", nifti_bytes(datatype=(128, 24)), "unknown_type 128"),
     "bits contradict the type": ("a.nii", nifti_bytes(datatype=(4, 32)), "unknown_type"),
     "NaN affine": ("a.nii", nifti_bytes(sform=SFORM * NAN), "not_finite"),
-    "zero affine": ("a.nii", nifti_bytes(sform=SFORM * 0), "implausible_spacing"),
-    "parallel axes": ("a.nii", nifti_bytes(sform=[[2, 3, 0, 0], [0, 0, 0, 0], [0, 0, 4, 0]]), "sheared"),
     "sheared affine": ("a.nii", nifti_bytes(sform=[[2, 0.03, 0, 0], [0, 3, 0, 0], [0, 0, 4, 0]]), "sheared"),
-    "huge affine": ("a.nii", nifti_bytes(sform=SFORM * 1e37), "geometry_contradicted"),
     "far origin": ("a.nii", nifti_bytes(sform=np.add(SFORM, [0, 0, 0, 1e8])), "too_far"),
     "affines disagree": ("a.nii", nifti_bytes(codes=(1, 1), qoffset=(10, 20, 31)), "geometry_contradicted"),
     "no affine": ("a.nii", nifti_bytes(codes=(0, 0)), "space_not_stated"),
     "quaternion too long": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(1, 1, 0)), "not_unit"),
     "negative pixdim": ("a.nii", nifti_bytes(pixdim=(1, -2, 3, 4, 0, 0, 0, 0), codes=(1, 0)), "not_positive"),
     "pixdim against sform": ("a.nii", nifti_bytes(pixdim=(1, 2, 3, 5, 0, 0, 0, 0)), "geometry_contradicted"),
-    "metres called mm": (
+    "metres": (
         "a.nii",
-        nifti_bytes(sform=SFORM / 1000, pixdim=(1, 0.002, 0.003, 0.004, 0, 0, 0, 0)),
+        nifti_bytes(sform=SFORM / 1000, pixdim=(1, 2e-3, 3e-3, 4e-3, 0, 0, 0, 0)),
         "implausible_spacing",
     ),
     "unknown unit": ("a.nii", nifti_bytes(units=5), "unknown_unit"),
     "NaN quaternion": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(NAN, 0, 0)), "not_unit"),
     "NaN offset": ("a.nii", nifti_bytes(vox_offset=NAN), "out_of_range"),
     "offset inside the header": ("a.nii", nifti_bytes(vox_offset=0), "out_of_range"),
-    "offset past the end": ("a.nii", nifti_bytes(vox_offset=1e9), "size_mismatch"),
     "NaN slope": ("a.nii", nifti_bytes(slope=NAN), "not_finite"),
-    "slope of zero": (
-        "a.nii",
-        nifti_bytes(slope=0.0)[:116] + struct.pack("<f", 7.0) + WHOLE[120:],
-        "scaling_ambiguous",
-    ),
+    "slope of zero": ("a.nii", WHOLE[:116] + struct.pack("<f", 7.0) + WHOLE[120:], "scaling_ambiguous"),
     "slope next to zero": ("a.nii", nifti_bytes(slope=1e-17), "scaling_ambiguous"),
-    "infinite voxel after scaling": (
-        "a.nii",
-        nifti_bytes(datatype=(16, 32), slope=1e30, data=np.full(120, 1e30, dtype="<f4").tobytes()),
-        "not_finite",
-    ),
-    "NaN voxel": ("a.nii", nifti_bytes(datatype=(16, 32), data=np.full(120, NAN, dtype="<f4").tobytes()), "not_finite"),
+    "infinite after scaling": ("a.nii", nifti_bytes(datatype=(16, 32), slope=1e30, data=all_of(1e30)), "not_finite"),
+    "NaN voxel": ("a.nii", nifti_bytes(datatype=(16, 32), data=all_of(NAN)), "not_finite"),
 }
-SIZED = ("sizes", "sizes: 30000 30000 30000")
 
 
 def test_axes_of_length_one_behind_the_three_of_space_are_none(tmp_path: Path) -> None:
@@ -343,23 +310,14 @@ FOUR_D = (("dimension", "dimension: 4"), ("sizes", "sizes: 2 4 5 3"))
 UNNAMED = nrrd_bytes(("space:", "space dimension: 3"))
 BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "empty": ("a.nrrd", b"", "file_size"),
-    "garbage": ("a.nrrd", b"\xff\xfe" * 600, "wrong_format"),
     "wrong magic": ("a.nrrd", nrrd_bytes().replace(b"NRRD0004", b"NRRD0009"), "wrong_format"),
     "not text": ("a.nrrd", nrrd_bytes(("kinds", "kinds: \u00e9")).replace(b"\xc3\xa9", b"\xff"), "not_text"),
     "header only": ("a.nrrd", "\n".join(NRRD_LINES).encode(), "file_cut"),
     "cut data": ("a.nrrd", nrrd_bytes(data=bytes(239)), "size_mismatch"),
     "too much data": ("a.nrrd", nrrd_bytes(data=bytes(241)), "size_mismatch"),
-    "terabytes": ("a.nrrd", nrrd_bytes(SIZED), "too_many"),
-    "gz cut": (
-        "a.nrrd",
-        nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(bytes(range(240)))[:-9]),
-        "file_damaged",
-    ),
-    "gz bomb": (
-        "a.nrrd",
-        nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(bytes(30_000_000))),
-        "size_mismatch",
-    ),
+    "terabytes": ("a.nrrd", nrrd_bytes(("sizes", "sizes: 30000 30000 30000")), "too_many"),
+    "gz cut": ("a.nrrd", nrrd_bytes(GZIP, data=gzip.compress(bytes(range(240)))[:-9]), "file_damaged"),
+    "gz bomb": ("a.nrrd", nrrd_bytes(GZIP, data=gzip.compress(bytes(30_000_000))), "size_mismatch"),
     "points at another folder": ("a.nhdr", nrrd_bytes(("data", "data file: ../a.raw"), data=b""), "outside_folder"),
     "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "no_such_file"),
     "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "outside_folder"),
@@ -373,23 +331,14 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "no space": ("a.nrrd", nrrd_bytes(("space:", None)), "missing_key"),
     "scanner space": ("a.nrrd", nrrd_bytes(("space:", "space: scanner-xyz")), "unknown_space"),
     "no origin": ("a.nrrd", nrrd_bytes(("space origin", None)), "missing_key"),
-    "NaN direction": (
-        "a.nrrd",
-        nrrd_bytes(("space directions", "space directions: (nan,0,0) (0,3,0) (0,0,4)")),
-        "not_finite",
-    ),
-    "no direction": (
-        "a.nrrd",
-        nrrd_bytes(("space directions", "space directions: none (0,3,0) (0,0,4)")),
-        "not_a_number",
-    ),
-    "sheared": ("a.nrrd", nrrd_bytes(("space directions", "space directions: (2,0,0) (1,3,0) (0,0,4)")), "sheared"),
+    "NaN direction": ("a.nrrd", nrrd_bytes(axes("(nan,0,0) (0,3,0)")), "not_finite"),
+    "no direction": ("a.nrrd", nrrd_bytes(axes("none (0,3,0)")), "not_a_number"),
+    "sheared": ("a.nrrd", nrrd_bytes(axes("(2,0,0) (1,3,0)")), "sheared"),
     "in metres": ("a.nrrd", nrrd_bytes(("space units", 'space units: "m" "m" "m"')), "unknown_unit"),
     "unknown field": ("a.nrrd", nrrd_bytes(("surprise", "surprise: 1")), "unknown_line"),
     "field twice": ("a.nrrd", nrrd_bytes(("x", "Sizes: 4 5 6")), "duplicate_key"),
     "no byte order": ("a.nrrd", nrrd_bytes(("endian", None)), "missing_key"),
     "skips": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: -1")), "unsupported_feature"),
-    "bzip2": ("a.nrrd", nrrd_bytes(("encoding", "encoding: bzip2")), "unsupported_feature"),
     "ascii": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1 " * 120), "unsupported_feature"),
     "several values per voxel": ("a.nrrd", nrrd_bytes(("kinds", "kinds: vector domain domain")), "unsupported_feature"),
     "two kinds": ("a.nrrd", nrrd_bytes(("kinds", "kinds: domain domain")), "unsupported_feature"),
@@ -418,25 +367,6 @@ def test_a_link_beside_a_nrrd_may_not_lead_away(tmp_path: Path) -> None:
     (tmp_path / "in" / "a.raw").symlink_to(write(tmp_path, "a.raw", VALUES.tobytes(order="F")))
     with refused("outside_folder"):
         read_volume(write(tmp_path / "in", "a.nhdr", nrrd_bytes(("data", "data file: a.raw"), data=b"")))
-
-
-@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.nrrd", "b.nrrd"])
-def test_whatever_the_bytes_only_input_errors_come_out(tmp_path: Path, name: str) -> None:
-    """A mutated file is refused or is a whole, finite volume of the size that its header says."""
-    gzipped = nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(VALUES.tobytes(order="F")))
-    content = {"a.nii": WHOLE, "a.nii.gz": PACKED, "a.nrrd": nrrd_bytes(), "b.nrrd": gzipped}[name]
-    random = Random(name)
-    for _ in range(60):
-        changed = bytearray(content)
-        for _ in range(random.randint(1, 6)):
-            changed[random.randrange(min(len(content), 352))] = random.randrange(256)
-        end = random.choice((len(changed), random.randrange(len(changed))))
-        try:
-            volume = read_volume(write(tmp_path, name, changed[:end]))
-        except InputError:
-            continue
-        assert np.isfinite(volume.T_ct_index).all() and np.isfinite(volume.values).all()
-        assert min(volume.values.shape) >= 2
 
 
 def test_axes_without_a_named_space_are_lps_as_to_itk_and_that_is_told(tmp_path: Path) -> None:
