@@ -27,6 +27,8 @@ def refused_command(arguments, capfd, code, *values):
     error = json.loads(captured.out)["error"]
     said = (one for one in captured.err.splitlines() if one.strip() and not one.startswith("warning: "))
     (line,) = [one for one in said if ", took " not in one]  # which a slow machine says of its stages
-    assert error["code"] == code and error["sentence"] in line and "allowed: " in line, (error, line)
+    assert set(error) == {"code", "sentence", "where", "allowed", "numbers"}
+    assert error["code"] == code and error["sentence"] in line, (error, line)
+    assert error["allowed"] and f"; allowed: {error['allowed']}" in line, (error, line)
     assert all(value in line for value in values), line
     return line

@@ -4,7 +4,6 @@ import errno
 import hashlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -265,18 +264,6 @@ def test_entries_split_from_a_command_go_with_it(tmp_path):
     manifest = read_manifest(tmp_path)
     assert manifest.owner("report.html") == "rehearse"
     assert manifest.entries["rehearse"].depends_on == ("plan",)
-
-
-def test_a_file_that_may_not_grow_is_bad_input(planned):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = contents(planned)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-        with refused("unwritable"):
-            write(planned, "plan", {"plan.json": "p" * 100_000})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert contents(planned) == before
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What a result was made from: each file read once, hashed as it was read, and listed with its role."""
+"""What a result was made from: each file read once, hashed as read, listed with its role, or said to be absent."""
 
 import hashlib
 import pickle
@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from refusals import refused
 
+from puncture_twin.planning.base.files import absence, read_input
 from puncture_twin.planning.base.provenance import Input, InputFiles, differing_input, inputs_document, read_inputs
 
 LISTED = (Input("case", "case.toml", "a" * 64), Input("mesh liver", "liver.stl", "b" * 64))
@@ -92,3 +93,25 @@ def test_the_input_that_differs_is_named() -> None:
     labels = [Input("labelmap", name, digest * 64) for name, digest in (("a.nii", "a"), ("b.nii", "b"))]
     swapped = [Input("labelmap", name, digest * 64) for name, digest in (("a.nii", "b"), ("b.nii", "a"))]
     assert differing_input(labels, swapped) == "labelmap (a.nii)"
+
+
+def test_what_is_in_a_files_place_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one in another case, which systems that fold cases would have found: by its reader too."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "Liver.STL").write_bytes(b"x")
+    (tmp_path / "link.stl").symlink_to("gone.stl")
+    for name, said in (
+        ("folder", "is a folder"),
+        ("link.stl", "is a link to a missing file"),
+        ("liver.stl", "does not exist; did you mean 'Liver.STL'?"),
+        *((one, "does not exist") for one in ("spleen.stl", "folder/spleen.stl", "none/a", "a" * 5000, "nul\0")),
+    ):
+        assert absence(tmp_path / name) == said
+    with refused("no_such_file", "Liver.STL"):
+        read_input(tmp_path / "liver.stl", max_bytes=10, where="liver.stl")
+
+    def denied(path: Path, **_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "stat", denied)
+    assert absence(tmp_path / "Liver.STL") == "cannot be looked up (Permission denied)"
