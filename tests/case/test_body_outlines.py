@@ -34,9 +34,10 @@ def test_a_ball_that_is_named_like_the_body_is_an_obstacle(tmp_path, capfd):
     code, said = init(capfd, tmp_path)
     assert code == 0, said
     lines = [one for one in said if "named like the outline of the body" in one]
-    found = prepare(tmp_path, arm=False).search()
+    context = prepare(tmp_path, arm=False)
+    found, given = context.search(), roles(context)
     for name, way in ways.items():
-        assert roles(tmp_path)[name] == ("avoid", 5.0)
+        assert given[name] == ("avoid", 5.0)
         assert any(f"'{name}'" in line and "of the skin" in line and "ignore" in line for line in lines)
         through = found.outward_ct @ way > np.cos(np.arctan2(10.0, 40.0))
         assert through.any() and not found.safe[through].any()
@@ -48,9 +49,10 @@ def test_around_the_lesion_it_is_unknown(tmp_path, capfd):
     for words, target in (((), "tumor"), (("--target", "-40,12,10", "--force"), "target")):
         code, said = init(capfd, tmp_path, *words)
         assert code == 0, said
-        assert {roles(tmp_path)[name] for name in NAMES[:2]} == {("unknown", 5.0)}
-        assert roles(tmp_path)[target][0] == "target"
-        assert words or not prepare(tmp_path, arm=False).search().safe.any()
+        context = prepare(tmp_path, arm=False)
+        given = roles(context)
+        assert {given[name] for name in NAMES[:2]} == {("unknown", 5.0)} and given[target][0] == "target"
+        assert words or not context.search().safe.any()
 
 
 OUTLINES = {
@@ -69,7 +71,8 @@ def test_the_outline_itself_is_left_out(tmp_path, capfd):
     write_case(tmp_path, **OUTLINES)
     code, said = init(capfd, tmp_path)
     assert code == 0, said
-    assert not OUTLINES.keys() & roles(tmp_path).keys() and prepare(tmp_path, arm=False).search().safe.any()
+    context = prepare(tmp_path, arm=False)
+    assert not OUTLINES.keys() & roles(context).keys() and context.search().safe.any()
     (line,) = [one for one in said if "treated as the outline of the body, so not checked (ignore)" in one]
     assert all(name in line for name in OUTLINES)
 
@@ -94,7 +97,7 @@ def test_of_meshes_the_one_that_holds_the_others_is_the_skin(tmp_path, capfd):
     assert init(capfd, tmp_path)[0] == 0
     context = prepare(tmp_path, arm=False)
     assert np.ptp(context.anatomy.skin.mesh.bounds[:, 0]) == pytest.approx(180.0, abs=2.0)
-    assert roles(tmp_path)["External"] == ("avoid", 5.0)
+    assert roles(context)["External"] == ("avoid", 5.0)
 
 
 def test_of_two_skins_one_is_the_skin_and_the_other_left_out(tmp_path, capfd):

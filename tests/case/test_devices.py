@@ -60,24 +60,18 @@ def test_the_defaults_are_those_of_the_reference(read):
     assert case.control_scan == ControlScanSection(slice_mm=2.0, target_seen=True, dose_msv=0.9, seconds=120.0)
 
 
-def test_every_key_is_read(read):
-    case = read(EVERY_KEY)
-    assert case.stereo.cameras_ct.tolist() == [[-250.0, -900.0, 300.0], [250.0, -900.0, 300.0]]
+@pytest.mark.parametrize(("space", "to_lps"), [("LPS", [1, 1, 1]), ("RAS", [-1, -1, 1])])
+def test_every_key_is_read_with_places_in_lps(read, space, to_lps):
+    case = read(EVERY_KEY, ('space = "LPS"', f'space = "{space}"'))
+    assert (case.stereo.cameras_ct * to_lps).tolist() == [[-250.0, -900.0, 300.0], [250.0, -900.0, 300.0]]
     assert (case.stereo.balls_mm, case.stereo.sd_mm) == ((60.0, 120.0, 180.0), 0.05)
     probe = case.ultrasound
     assert (probe.model.name, probe.target_sd_mm, probe.tip_sd_mm) == ("ur5", (0.6, 1.0), (0.3, 1.0))
     assert (probe.calibration_sd_mm, probe.depth_mm, probe.width_mm) == (0.1, 120.0, 60.0)
     assert case.control_scan == ControlScanSection(slice_mm=3.0, target_seen=False, dose_msv=0.4, seconds=90.0)
     T_ct_base = np.linalg.inv(probe.T_base_ct_mount)
-    assert T_ct_base[:3, 3] == pytest.approx([-600.0, 20.0, -30.0])
-    assert T_ct_base[:3, 2] == pytest.approx([0.0, -1.0, 0.0], abs=1e-12)
-    assert case.motion.target_cov_ct == pytest.approx(np.diag([0.04, 0.09, 1.21]))
-
-
-def test_places_of_a_ras_case_are_turned_to_lps(read):
-    case = read(EVERY_KEY, ('space = "LPS"', 'space = "RAS"'))
-    assert case.stereo.cameras_ct.tolist() == [[250.0, 900.0, 300.0], [-250.0, 900.0, 300.0]]
-    assert np.linalg.inv(case.ultrasound.T_base_ct_mount)[:3, 3] == pytest.approx([600.0, -20.0, -30.0])
+    assert T_ct_base[:3, 3] * to_lps == pytest.approx([-600.0, 20.0, -30.0])
+    assert T_ct_base[:3, 2] * to_lps == pytest.approx([0.0, -1.0, 0.0], abs=1e-12)
     assert case.motion.target_cov_ct == pytest.approx(np.diag([0.04, 0.09, 1.21]))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from case_world import ball
 from refusals import refused
-from round_body import BODY, X, inside, write_ct, write_image, write_mask
+from round_body import BODY, X, inside, run_init, write_ct, write_image, write_mask
 
 from puncture_twin.planning.init.overrides import overrides_of, with_keys
 from puncture_twin.planning.search.context import prepare
@@ -33,8 +33,8 @@ def write_masks(folder):
 
 
 def init(capfd, folder, *words):
-    code = main(["init", str(folder), *(() if any("--target" in word for word in words) else TARGET), *words])
-    return code, capfd.readouterr().err
+    code, _, said = run_init(capfd, folder, *(() if any("--target" in word for word in words) else TARGET), *words)
+    return code, "\n".join(said)
 
 
 def roles(folder):
@@ -99,7 +99,7 @@ def test_what_is_left_out_holds_no_target(tmp_path, capfd):
     write_labels(tmp_path, (*BALLS, "rest"))
     assert init(capfd, tmp_path, "--target=-10,0,10", "--ignore", "rest")[0] == 0
     context = prepare(tmp_path, arm=False)
-    assert context.case.own_target and "rest" not in roles(tmp_path)
+    assert context.case.own_target and "rest" not in {one.name for one in context.anatomy.structures}
 
 
 @pytest.mark.parametrize(
@@ -166,11 +166,11 @@ def test_a_stated_skin_goes_before_the_cts_body(tmp_path, capfd):
     assert context.case.skin_section.labelmap == "map.nii.gz" and context.case.ct.file == "ct.nii.gz"
 
 
-def test_the_image_is_proposed_as_statements(tmp_path, capfd):
+def test_the_image_is_proposed_as_statements(tmp_path):
     """Commented keys: without its # each is one that the case takes; a picture shows what was found."""
     write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
-    assert init(capfd, tmp_path)[0] == 0
+    assert main(["init", str(tmp_path), *TARGET]) == 0
     case = tmp_path / "case.toml"
     text = case.read_text()
     assert "# arms: none found" in text and (tmp_path / "slices.png").stat().st_size > 1000
