@@ -23,7 +23,6 @@ COUNTED_LATE = frozenset(
         "tests/batch/test_cohort_page.py::browser",
         "tests/jobs/test_hostile.py::runner",
         "tests/twin/report/test_page_browser.py::browser",
-        "tests/twin/report/test_page_widths.py::browser",
     }
 )
 """Fixtures whose processes are waited for, and so counted, at their end: a browser's take seconds, half a minute."""

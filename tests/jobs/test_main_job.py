@@ -148,7 +148,7 @@ def test_of_many_rooms_the_median_is_shown(carton, rehearsed, run, tmp_path):
     assert int(place) == round(one["percentile"])
     assert 'href="rehearsal.gif"' in page and "rehearsal.mp4" not in page
     assert 'href="rehearsal.mp4"' in (rehearsed / "report.html").read_text()
-    assert {"rehearsal.gif", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"rehearsal.gif", "rooms.png", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
     assert problems(tmp_path / "out") == ()
     assert main(["rehearse", str(carton), "--physics", "1", "--out", str(tmp_path / "no")]) == BAD_INPUT
 

@@ -1,7 +1,6 @@
 """What map and page show of chances: where there are some, and nothing new where there are none."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from PIL import Image
 from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, UncertaintyBreakdown
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
-from puncture_twin.twin.report.error_pictures import draw_rooms_picture
 from puncture_twin.twin.report.map.map_raster import chance_raster, map_raster, touch_nothing
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Uncertainty, methods_text
@@ -127,23 +125,3 @@ def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
 def test_rooms_without_any_that_was_reached_say_nothing():
     said = text([Section("many trials", rooms({**ROOMS, "realised_rms_mm": None}))])
     assert "the needle reached the target in none" in said and "realised" not in said and rooms(None) == []
-
-
-class Found(SimpleNamespace):
-    """Trials as the picture takes them."""
-
-    def __len__(self):
-        return len(self.error_ct)
-
-
-def test_the_clouds_of_many_rooms_are_drawn(tmp_path):
-    outward = np.array([0.6, 0.0, 0.8])
-    error = np.random.default_rng(0).normal(size=(300, 3)) * [1.0, 2.0, 0.5]
-    found = Found(
-        puncture=SimpleNamespace(outward_ct=outward), error_ct=error, cov_ct=np.diag([1.0, 4.0, 0.25]), seed=0,
-        in_region=np.arange(300) < 285, realised_rms_mm=2.3, predicted_rms_mm=2.29,
-        tip_error_mm=np.linalg.norm(error, axis=1),
-        hit_share=0.7, p_hit=0.71, touched=np.zeros((300, 2), bool), p_touch=np.array([0.01, 0.0]),
-    )  # fmt: skip
-    draw_rooms_picture(found, tmp_path / "rooms.png")
-    assert Image.open(tmp_path / "rooms.png").size[0] > 1000

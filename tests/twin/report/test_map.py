@@ -11,7 +11,6 @@ from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Re
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.twin.report.map import map_raster
 from puncture_twin.twin.report.map.map_picture import map_figure
-from puncture_twin.twin.report.map.map_raster import RINGS_CLEAR, ring_labels
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.numbers import reason_counts
 from puncture_twin.twin.report.page.page_data import map_data
@@ -82,18 +81,6 @@ def test_one_clearance_is_one_shade_and_no_scale(case, candidates, said, clearan
     assert {"5.0 mm", "11.5 mm", "safe, by least clearance"} <= set(said)
 
 
-def test_no_mark_stands_on_the_angle_of_a_ring(case, candidates):
-    """Where a mark lies on one, all are written along another azimuth; where marks are everywhere, as usual."""
-    view = map_view(case, candidates)
-    usual = ring_labels(view, np.zeros((0, 2)))
-    mark = np.array([[usual[1].x + 0.02, usual[1].y]])
-    moved = ring_labels(view, mark)
-    assert [label.text for label in moved] == [label.text for label in usual]
-    assert min(np.hypot(label.x - mark[0, 0], label.y - mark[0, 1]) for label in moved) > RINGS_CLEAR
-    everywhere = np.stack(np.meshgrid(*[np.linspace(-1, 1, 60)] * 2), axis=-1).reshape(-1, 2)
-    assert ring_labels(view, everywhere) == usual
-
-
 def front_of(found, rows):
     """The same directions with this front."""
     pareto = np.zeros(len(found), dtype=bool)
@@ -113,14 +100,6 @@ def test_a_large_front_is_thinned_and_says_so(case, candidates):
     assert np.linalg.norm(places[:, None] - dots, axis=2).min(axis=1).max() < 0.35
     whole = map_raster.shown_front(few, view)
     assert whole.text == "Pareto front" and sorted(whole.rows) == sorted(safe[: map_raster.MOST_DOTS])
-
-
-def test_one_direction_is_one_dot(case, candidates):
-    """At θ = 0 every β is the same direction."""
-    pole = np.flatnonzero(candidates.safe & (candidates.theta < 1e-9))
-    assert len(pole) > map_raster.MOST_DOTS
-    shown = map_raster.shown_front(front_of(candidates, pole), map_view(case, candidates))
-    assert len(shown.rows) == 1 and shown.text == "Pareto front"
 
 
 def test_a_needle_through_a_structure_crosses_it(case, candidates):

@@ -16,7 +16,6 @@ import trimesh
 from matplotlib.text import Text
 from PIL import Image, ImageDraw
 
-from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables import EntryAxes
@@ -24,15 +23,15 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report import annotate, patient as patient_blocks
-from puncture_twin.twin.report.map.map_picture import DISC, draw_map, map_figure
-from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
+from puncture_twin.twin.report.map.map_picture import DISC, map_figure
+from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view, step_of
 from puncture_twin.twin.report.numbers import length_text, nearest_text, reason_counts
 from puncture_twin.twin.report.page import page_data
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_data import TRIANGLES, lightened, map_data
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
-from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
+from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import Layer
 from puncture_twin.twin.report.scene import film, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film, model_note
@@ -45,7 +44,7 @@ from puncture_twin.twin.report.scene.scene_parts import (
     patient,
     up_ct,
 )
-from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
+from puncture_twin.twin.report.scene.scene_picture import draw_scene, render_bodies
 
 FRAMES = {
     "bed": ("LPS", None),
@@ -102,7 +101,7 @@ def test_the_map_is_what_a_camera_outside_sees(name):
         assert angle_between(np.arctan2(y, x), label.angle) < 1e-3
 
 
-@pytest.mark.parametrize("theta_max", [60, 90, 150, 180])
+@pytest.mark.parametrize("theta_max", [60, 180])
 def test_the_map_has_no_gap_and_each_pixel_the_colour_of_its_reason(case, theta_max):
     """Every pixel within the rim belongs to a cell; the one where (θ, β) lies shows the verdict of (θ, β)."""
     found = world.make_candidates(case, theta_deg=(0, theta_max))
@@ -130,23 +129,13 @@ def map_pixel(image, view, theta_deg, beta_deg):
     return image.getpixel((int(column), int(line)))
 
 
-def test_the_finished_map_is_the_same_file_each_time(case, candidates, tmp_path):
-    """Sets of files are known by their hashes: no date, and no name of a program that may be a newer one tomorrow."""
-    first, again = tmp_path / "map.png", tmp_path / "again.png"
-    for path in (first, again):
-        draw_map(candidates, case, path)
-    assert first.read_bytes() == again.read_bytes()
-    assert sorted(tmp_path.iterdir()) == [again, first]
-    assert Image.open(first).info.keys() <= {"dpi"}
-    image, view = Image.open(first).convert("RGB"), map_view(case, candidates)
+def test_the_finished_map_has_the_colours_where_they_belong(case, candidates):
+    """Of a refusal by its length, one by a rib, a safe direction; and of the only direction of a grid."""
+    image, view = world.map_image(candidates, case), map_view(case, candidates)
     assert map_pixel(image, view, 82.0, 200.0) == REASON_COLOURS["too_long"]
     assert map_pixel(image, view, 35.0, 48.0) == REASON_COLOURS["too_close"]
     red, green, blue = map_pixel(image, view, 40.0, 223.0)
     assert green > 1.2 * red and green > blue
-
-
-def test_a_map_of_nothing_safe_and_of_one_direction(case):
-    assert world.map_image(world.make_candidates(case, safe=False), case).width > 300
     one = world.make_candidates(case, theta_deg=(40, 40), beta_deg=(200, 200))
     assert len(one) == 1
     assert map_pixel(world.map_image(one, case), map_view(case, one), 20.0, 200.0) == (255, 255, 255)
@@ -161,17 +150,6 @@ def test_counts_and_solid_angles(case, candidates):
     weights = ring_weights(candidates.theta, step_of(candidates))
     cap = weights[candidates.theta < np.radians(31)].sum() / weights.sum()
     assert cap == pytest.approx((1 - np.cos(np.radians(32.5))) / (1 - np.cos(np.radians(92.5))))
-
-
-def test_camera_round_trip(rng):
-    points = rng.uniform(-100, 100, (50, 3))
-    camera = camera_around(points, np.array([0.3, 1, -0.4]), np.array([0, 0, 1.0]), fov=0.5, width=300, height=200)
-    seen = camera.project(points)
-    assert (seen[:, :2] >= 0).all() and (seen[:, :2] <= [300, 200]).all()
-    column, row = np.floor(seen[:, :2]).astype(int).T
-    rays = world.rays(camera).reshape(200, 300, 3)[row, column]  # through the middle of the pixel
-    way = (points - camera.eye) / np.linalg.norm(points - camera.eye, axis=1)[:, None]
-    assert np.linalg.norm(rays - way, axis=1).max() < 0.75 / camera.scale
 
 
 def test_the_corridor_is_where_the_safe_directions_are(case, candidates):
@@ -263,16 +241,6 @@ def test_the_scene_with_and_without_an_answer(anatomy, case, candidates, plan, t
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_many_structures_share_legend_lines():
-    names = [(f"rib_left_{i}", (1, 1, 1)) for i in range(24)] + [
-        ("aorta", (2, 2, 2)),
-        ("liver", (3, 3, 3)),
-        ("x", (4, 4, 4)),
-    ]
-    assert families(names) == [("rib (24)", (1, 1, 1)), ("aorta", (2, 2, 2)), ("liver", (3, 3, 3)), ("x", (4, 4, 4))]
-    assert families(names[-3:]) == names[-3:]
-
-
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
 def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
     """The encoder is told how many threads it has: it does not take as many as there are cores."""
@@ -338,37 +306,33 @@ def decoded(path):
     return meta, frames
 
 
-def test_the_film_has_the_frames_it_says(anatomy, case, plan, tmp_path):
-    """Frame count, duration and size are as stated; the needle comes down; the last frame stands still."""
-    rehearsal = world.make_rehearsal(plan, total_s=1.0)
-    written = draw_film(rehearsal, plan, case, anatomy, tmp_path / "film.mp4")
-    assert written == tmp_path / "film.mp4"
+def test_the_film_has_the_frames_it_says_shows_the_patient_and_ends_with_the_result(anatomy, case, plan, tmp_path):
+    """Count, duration and size as stated; the needle comes down; the last frame stands still, the end written over it.
+
+    The body fills the overview, and the needle is four pixels wide at least.
+    """
+    done = world.make_rehearsal(plan, total_s=1.0)
+    done.contacts = ()
+    written = draw_film(done, plan, case, anatomy, tmp_path / "film.mp4")
+    assert written == tmp_path / "film.mp4" and [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
     times = film.film_times(1.0)
     meta, frames = decoded(written)
     assert meta["size"] == (film.WIDTH, film.HEIGHT) and meta["fps"] == film.FRAMES_PER_SECOND
     assert len(frames) == times.frames
     assert meta["duration"] == pytest.approx(times.duration_s, abs=0.15)
+    end, last = len(times.moments) - 1, frames[-1]
     view = np.s_[80 : film.VIEW_HEIGHT, : film.VIEW_WIDTH]
-    moved = np.abs(frames[0][view].astype(int) - frames[len(times.moments) - 1][view]).mean()
-    still = np.abs(frames[-1][view].astype(int) - frames[len(times.moments) - 1][view]).mean()
+    moved, still = (np.abs(one[view].astype(int) - frames[end][view]).mean() for one in (frames[0], last))
     assert moved > 10 * still
-    assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
-
-
-def test_the_film_shows_the_patient_and_ends_with_the_result(anatomy, case, plan, tmp_path, monkeypatch):
-    """The body fills the overview, the needle is four pixels wide at least, and the end is written over it."""
-    monkeypatch.setattr(film, "film_times", lambda total: film.FilmTimes((0.0, 0.7 * total, total), 1.0, 1))
-    done = world.make_rehearsal(plan)
-    done.contacts = ()
-    _, (_, before, *_, last) = decoded(draw_film(done, plan, case, anatomy, tmp_path / "film.mp4"))
-    view = before[: film.VIEW_HEIGHT, : film.VIEW_WIDTH].astype(int)
-    reddish = view[..., 0] - view[..., 2] > 12  # skin and organs; ground and arm are grey or blue
+    before = frames[int(0.7 * end)]
+    body = before[: film.VIEW_HEIGHT, : film.VIEW_WIDTH].astype(int)
+    reddish = body[..., 0] - body[..., 2] > 12  # skin and organs; ground and arm are grey or blue
     assert np.ptp(np.flatnonzero(reddish.sum(axis=1) > 20)) > 0.7 * film.VIEW_HEIGHT
-    dark = (view < 70).all(axis=2)[60]
+    dark = (body < 70).all(axis=2)[60]
     assert 4 <= dark.sum() <= 8 and np.ptp(np.flatnonzero(dark)) < 8
     band = np.s_[film.VIEW_HEIGHT - 36 : film.VIEW_HEIGHT - 8, 10:400]
-    written = [(frame[band].astype(int) < 60).all(axis=2).sum() for frame in (before, last)]
-    assert written[1] > 500 > 10 * written[0]
+    inked = [(frame[band].astype(int) < 60).all(axis=2).sum() for frame in (before, last)]
+    assert inked[1] > 500 > 10 * inked[0]
 
 
 def test_after_a_checked_search_the_arm_is_in_the_scene(anatomy, case, candidates, plan):
@@ -438,15 +402,15 @@ def test_the_page_holds_the_numbers(report):
 
 
 def test_without_markers_the_page_says_what_is_not_known(tmp_path):
-    """No dash and no NaN where an error would be expected; and that the truth was the belief."""
-    case = world.make_case()
+    """No dash and no NaN where an error would be expected; that the truth was the belief; a target in RAS as typed."""
+    case = world.make_case(space="RAS")
     candidates = world.make_candidates(case)
     plan = world.make_plan(case, candidates)
     plan.expected_target_error_mm = float("nan")
     rehearsal = world.make_rehearsal(plan)
     rehearsal.predicted_error_mm, rehearsal.truth_is_belief = float("nan"), True
     text = page_of(tmp_path, case, world.make_anatomy(), candidates, plan, rehearsal)
-    assert text.count("unknown (no markers)") == 3 and "NaN" not in text
+    assert text.count("unknown (no markers)") == 3 and "NaN" not in text and "at (-10.0, 20.0, 30.0) mm RAS" in text
     assert 0 < text.index("The truth equals the belief") < text.index("safe directions")
 
 
@@ -468,31 +432,6 @@ def test_verdict_and_doubt_come_first(report):
     assert text.index("safe directions") < text.index('<h2 id="doubt"')
     assert set(re.findall(r'<a href="#([^"]+)"', text)) <= set(re.findall(r'id="([^"]+)"', text))
     assert "of the solid angle" in text and "at (10.0, -20.0, 30.0) mm LPS" in text
-
-
-def test_what_is_unknown_is_hatched(case, candidates):
-    """By a second colour, in lines: the grey alone is near the green of safe for the colour-blind."""
-    reason = np.where(candidates.verdict.reason == "too_close", "unknown_region", candidates.verdict.reason)
-    unknown = replace(candidates, verdict=replace(candidates.verdict, reason=reason))
-    raster = map_raster(unknown, map_view(case, unknown), 200)
-    inside = np.append(reason == "unknown_region", False)[raster.rows]
-    lines = (raster.rgba[..., :3] == HATCH).all(axis=-1)
-    assert 0.15 < lines[inside].mean() < 0.35 and not lines[~inside].any()
-
-
-def test_notes_are_folded_below_the_warnings(candidates, tmp_path):
-    """A note of ``--json`` is on the page, not among what is not known; without any nothing unfolds.
-
-    The target of a case in RAS stands there as it was typed.
-    """
-    case = world.make_case(space="RAS")
-    anatomy = world.make_anatomy(warnings=("a warning",))
-    without = page_of(tmp_path, case, anatomy, candidates)
-    anatomy.findings = (Finding("far", Severity.NOTE, "a <note>"),)
-    with_note = page_of(tmp_path, case, anatomy, candidates)
-    assert '<li class="bad">a warning</li>' in with_note and '<li class="bad">a &lt;note' not in with_note
-    assert "<details><summary>Notes (1)</summary><ul><li>a &lt;note&gt;</li></ul></details>" in with_note
-    assert "<summary>Notes" not in without and "at (-10.0, 20.0, 30.0) mm RAS" in without
 
 
 def test_nothing_safe_is_said_first(anatomy, case, tmp_path):
@@ -576,36 +515,6 @@ def test_meshes_are_lightened_but_none_is_lost(ball):
     assert TRIANGLES <= 100_000
     for before, after in zip(bodies, light, strict=True):
         assert np.allclose(before.mesh.bounds, after.mesh.bounds, atol=0.02 * np.ptp(before.mesh.bounds))
-
-
-@pytest.mark.parametrize("toward", [(0.1, 0.6, -0.75), (0.0, 1.0, 0.2), (0.7, 0.5, -0.5), (-0.9, 0.1, -0.3)])
-def test_the_cross_s_words_keep_apart(monkeypatch, case, toward):
-    boxes = []
-    image = ImageDraw.Draw(Image.new("RGB", (300, 300)))
-
-    def note(draw, at, words, *, size, bold, anchor, **look):
-        boxes.append(draw.textbbox(at, words, font=annotate.font(size, "bold" if bold else "plain"), anchor=anchor))
-
-    monkeypatch.setattr(annotate, "write", note)
-    camera = ViewCamera(-500 * np.array(toward), np.zeros(3), np.array([0, -1.0, 0.1]), 0.5, 200, 200)
-    annotate.body_axes(image, camera, case.space, (150.0, 150.0), 44.0)
-    assert len(boxes) >= 4
-    for i, a in enumerate(boxes):
-        for b in boxes[:i]:
-            assert a[0] >= b[2] or b[0] >= a[2] or a[1] >= b[3] or b[1] >= a[3]
-
-
-def test_the_legend_names_the_room(anatomy, case, candidates, tmp_path, monkeypatch):
-    """A gantry and a table are named; the see-through one is said to be."""
-    written = []
-    monkeypatch.setattr(annotate, "legend", lambda draw, items, *place: written.extend(n for n, _ in items) or 900.0)
-    monkeypatch.setattr(scene_picture, "LEFT_BOX", (16, 84, 216, 284))
-    monkeypatch.setattr(scene_picture, "RIGHT_BOX", (230, 84, 430, 284))
-    mesh = anatomy.skin.mesh
-    stand_in = SceneBody("gantry", "room", mesh, (1, 2, 3), 0.15), SceneBody("table", "room", mesh, (1, 2, 3))
-    monkeypatch.setattr(scene_picture.scene_parts, "room", lambda *_: stand_in)
-    draw_scene(Shown(case, anatomy, candidates), tmp_path / "scene.png")
-    assert {"gantry (see-through)", "table"} <= set(written)
 
 
 @pytest.mark.parametrize("role", ["avoid", "traverse"])

@@ -1,6 +1,5 @@
 """Slices about a path: where the planes lie, what is cut, and what is drawn where."""
 
-from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,8 +11,6 @@ from PIL import Image
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.candidates import Pick
-from puncture_twin.twin.report.annotate import font
-from puncture_twin.twin.report.slices import sheet
 from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, PIXELS, TONES, Subject, draw_panel, stored
 from puncture_twin.twin.report.slices.planes import capsule, ellipse, letters, needle_planes, outline
 from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet
@@ -161,20 +158,6 @@ def test_with_a_ct_and_errors(tmp_path):
     assert Image.open(tmp_path / "one.png").width > 2 * PIXELS
 
 
-def test_no_two_lines_of_the_sheet_overlap(monkeypatch, tmp_path):
-    """A plane's name and how the needle lies to it, which had one line, each in its own box."""
-    boxes = []
-
-    def written(draw, at, text, *, size=16, bold=False, colour=None, anchor="la", halo=0):
-        boxes.append((draw.textbbox(at, text, font(size, bold), anchor), text))
-
-    monkeypatch.setattr(sheet, "write", written)
-    write_sheet(draw_slices(subject()), tmp_path / "slices.png")
-    assert sum("needle" in text for _, text in boxes) >= 4
-    for ((left, top, right, bottom), one), ((x, y, far, low), other) in combinations(boxes, 2):
-        assert right <= x or far <= left or bottom <= y or low <= top, (one, other)
-
-
 def test_an_image_alone_proposes_no_needle(tmp_path):
     """Three planes through the target that hold the body, what lies beside it in the legend, and nothing cyan."""
     one = subject(scan=SimpleNamespace(hu_at=ball_ct))
@@ -207,19 +190,6 @@ def test_unknown_structures_are_beads_and_a_refused_direction_is_drawn_too():
     one.pick.candidates.path.length.setflags(write=True)
     one.pick.candidates.path.length[:] = np.nan
     assert draw_slices(one).units is None
-
-
-def test_the_legend_names_the_nearest_and_no_beads_that_are_not_there():
-    """However far the nearest is; of beads it speaks where something is unknown."""
-    one = subject()
-    one.pick.candidates.clearance.by_structure.setflags(write=True)
-    one.pick.candidates.clearance.by_structure[:] = [48.0, 55.0]
-    assert one.near == () and one.margin_mm == 0
-    drawn = draw_slices(one)
-    assert drawn.legend[-1][0] == "rib right 9: 48.0 mm, margin 1"
-    assert not any("Beads" in note for note in drawn.notes)
-    one.anatomy.structures[1].role = "unknown"
-    assert any("Beads: the edge of what is unknown." in note for note in draw_slices(one).notes)
 
 
 @given(UNITS, st.floats(5, 200), st.floats(0.3, 20), st.integers(0, 3))
