@@ -111,18 +111,24 @@ class UniformErrors(np.random.Generator):
 @cache
 def room_of(play_deg: float) -> tuple[SelfcalCase, TwoArms, CandidatePoses, NDArray[np.int_]]:
     """The shipped case with a play, its checker, its candidates, and the rows that are recorded."""
-    case = load_selfcal_case(CASE)
+    case, room, candidates = shipped()
     content = case.content.model_copy(deep=True)
     arms = {}
     for name in ("probe_arm", "needle_arm"):
         arm = getattr(content, name)
         arms[name] = arm.model_copy(update={"errors": arm.errors.model_copy(update={"backlash_deg": play_deg})})
     case = SelfcalCase(case.path, content.model_copy(update=arms), case.inputs)
-    room = TwoArms(case)
-    candidates = find_candidates(case, room, np.random.default_rng(case.content.seed))
     left = np.arange(len(candidates.q_probe))
     chosen = choose(case, candidates, left, case.content.poses.count, np.random.default_rng(0), [])
     return case, room, candidates, chosen
+
+
+@cache
+def shipped() -> tuple[SelfcalCase, TwoArms, CandidatePoses]:
+    """The shipped case, its checker and candidates, which no play changes."""
+    case = load_selfcal_case(CASE)
+    room = TwoArms(case)
+    return case, room, find_candidates(case, room, np.random.default_rng(case.content.seed))
 
 
 def outcome(kind: Kind, seed: int) -> Outcome:
