@@ -53,18 +53,6 @@ def test_pixels_lie_where_the_plane_says():
     assert points[0, 0] @ plane.right < points[0, 1] @ plane.right
 
 
-def test_a_ball_is_cut_in_a_circle():
-    """A plane at 3 mm from the middle of a ball of 5 mm cuts a circle of 4 mm; one beyond it cuts nothing."""
-    ball = trimesh.creation.icosphere(5, 5.0)
-    mesh = TriangleMesh(np.asarray(ball.vertices), np.asarray(ball.faces))
-    plane = needle_planes(np.array([0.0, 0.0, 3.0]), np.array([0.0, -1.0, 0.0]), 50.0)[0]
-    cut = outline(mesh, plane)
-    assert np.allclose(np.linalg.norm(cut, axis=2), 4.0, atol=0.01)
-    assert np.isclose(np.linalg.norm(np.diff(cut, axis=1), axis=2).sum(), 8 * np.pi, rtol=1e-3)
-    beyond = needle_planes(np.array([0.0, 0.0, 5.1]), np.array([0.0, -1.0, 0.0]), 50.0)[0]
-    assert outline(mesh, beyond).shape == (0, 2, 2)
-
-
 @given(UNITS, st.integers(0, 9))
 def test_a_cut_is_that_of_another_library(direction, seed):
     """The segments, ends in either order, that trimesh finds of a soup of triangles that share corners."""

@@ -21,13 +21,6 @@ def job_parts(text):
     return dict.fromkeys(JOB, text) | {"title": text, "cards": [Card(text, text, text)]}
 
 
-@pytest.mark.parametrize(
-    "name", sorted(path.name for path in (files("puncture_twin.twin.report") / "templates").iterdir())
-)
-def test_every_template_is_in_the_package_and_is_read(name):
-    assert (files("puncture_twin.twin.report") / "templates" / name).read_text(encoding="utf-8")
-
-
 def test_plotly_is_the_published_bundle():
     """Every byte of the script and of its licence is what was pinned, and the page says whose it is."""
     folder = files("puncture_twin.twin.report") / "plotly_js"
