@@ -181,35 +181,3 @@ def test_a_command_on_a_case_of_its_own_killed_at_random(command, tmp_path):
         for case in cases:
             case.write_text(case.read_text() + PLACE)
     kills(command, command, [[verb, case, *options] for case in cases], cases, tmp_path / "out")
-
-
-def state_by_page(out, old, new):
-    """As `state_of`, of a set that is known by the hash of its page."""
-    manifest = read_manifest(out)
-    if "reproduce" not in manifest.entries:
-        return "unfinished"
-    assert [line for line in problems(out) if "left over" not in line] == []
-    return {old: "old", new: "new"}[manifest.files["servo.html"]]
-
-
-@needs_time
-def test_reproduce_killed_at_random(tmp_path):
-    """Liu 2007, the only paper that writes files; its runs have the same inputs, and are told apart by their page."""
-    out, rng, counts, pages = tmp_path / "out", generator("reproduce"), Counter(), []
-    runs = [["reproduce", "liu2007", "--seeds", seeds, "--out", str(out)] for seeds in ("1", "2")]
-    for run in reversed(runs):
-        assert main(run) in (OK, ANSWER_IS_NO)
-        pages.insert(0, sha256(out / "servo.html"))
-    stands = 0
-    for _ in range(KILLS):
-        new = 1 - stands
-        running = kill_while_writing(start(runs[new]), out, rng)
-        left = state_by_page(out, pages[stands], pages[new])
-        counts[left] += running
-        if left == "unfinished":
-            assert main(runs[new]) in (OK, ANSWER_IS_NO)
-        stands = stands if left == "old" else new
-        assert sha256(out / "servo.html") == pages[stands]
-    assert main(runs[stands]) in (OK, ANSWER_IS_NO)
-    assert problems(out) == () and temporaries(out) == []
-    sys.stdout.write(said("reproduce", counts) + "\n")

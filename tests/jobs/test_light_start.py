@@ -24,7 +24,8 @@ def left_loaded(*asked):
 def test_a_command_loads_no_library_that_it_does_not_use(tmp_path):
     """Help and a wrong argument none of numbers; a search none of the arm and pictures that nobody asked it for.
 
-    With pictures no window system is asked for, and nothing is drawn that another part of a program has set up.
+    A check of one direction none that writes tables. With pictures no window system is asked for, and nothing is drawn
+    that another part of a program has set up.
     """
     assert left_loaded(
         (["rehearse", "--help"], NUMBERS),
@@ -34,7 +35,4 @@ def test_a_command_loads_no_library_that_it_does_not_use(tmp_path):
         ([*SEARCH, tmp_path / "out"], {"matplotlib.pyplot", "plotly"}),
     ) == ["LOADED 0", "LOADED 2", "LOADED 2", "LOADED 0", "LOADED 0"]
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"map.png", "scene.png", "slices.png", "report.html"}
-
-
-def test_a_check_of_one_candidate_loads_no_writer_of_tables():
     assert left_loaded((CHECK, {"pyarrow", "matplotlib", "plotly"})) == ["LOADED 0"]

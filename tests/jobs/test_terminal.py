@@ -107,14 +107,6 @@ def test_a_shell_completes_commands_and_options(words, completed):
     assert (done.returncode, done.stderr, set(done.stdout.split())) == (0, "", completed)
 
 
-@pytest.mark.parametrize("shell", ["bash", "fish"])
-def test_each_shell_is_told_how_to_ask(shell):
-    """The script that --install-completion installs names the variable by which it asks."""
-    done = run_as_installed({"_RUN_TWIN_COMPLETE": f"source_{shell}"})
-    assert (done.returncode, done.stderr) == (0, "")
-    assert f"_RUN_TWIN_COMPLETE=complete_{shell}" in done.stdout
-
-
 def run_as_installed(environment):
     """The command under the name that is installed."""
     return run_program([], environment, "import sys\nsys.argv[0] = 'run-twin'")
@@ -156,7 +148,7 @@ def test_neither_width_nor_colour_changes_what_is_printed():
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is of Linux")
-@pytest.mark.parametrize(("arguments", "unbuffered"), [(["--version"], ""), (["--help"], "1"), (ONE, "")])
+@pytest.mark.parametrize(("arguments", "unbuffered"), [(["--help"], "1"), (ONE, "")])
 def test_a_full_disk_under_stdout_is_told_in_one_line(arguments, unbuffered):
     with Path("/dev/full").open("w") as full:
         done = run_program(arguments, {"PYTHONUNBUFFERED": unbuffered}, stdout=full)
