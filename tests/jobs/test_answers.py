@@ -9,25 +9,10 @@ import numpy as np
 import pytest
 import typer
 
-from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, PROGRAM_FAILED, RULES, finish
 from puncture_twin.twin.jobs.patient.run import rehearsal_failures, trial_failures
 
 ROOT = Path(__file__).parents[2]
-
-
-def commands(group, before=""):
-    for name, command in group.commands.items():
-        below = hasattr(command, "commands")
-        yield from commands(command, f"{before}{name} ") if below else [f"{before}{name}"]
-
-
-def test_the_page_says_of_every_command_when_its_answer_is_no():
-    """No command without a sentence, no sentence of another; what is never no has no rule."""
-    page = (ROOT / "docs" / "reference" / "command-line.md").read_text(encoding="utf-8")
-    rows = dict(re.findall(r"^\| `([^`]+)` \| (.+) \|$", page.split("## `demo`")[0], re.MULTILINE))
-    assert {name.partition(" --")[0] for name in rows} == set(commands(typer.main.get_command(app)))
-    assert set(RULES) <= {name for name, no in rows.items() if not no.startswith("never")}
 
 
 def test_no_command_ends_by_another_rule():

@@ -13,6 +13,7 @@ from walls.house import modules, tree
 
 from puncture_twin.planning.export.exporter import GROUP
 from puncture_twin.run_twin import app
+from puncture_twin.twin.jobs.exit_codes import RULES
 
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
 
@@ -110,6 +111,14 @@ def test_the_command_line_is_described():
         options = [option for one in command.params for option in one.opts if option.startswith("--")]
         assert [option for option in options if option not in section] == [], name
         assert f"`{name.partition(' ')[0]}" in (ROOT / "README.md").read_text(encoding="utf-8"), name
+
+
+def test_the_page_says_of_every_command_when_its_answer_is_no():
+    """No command without a sentence, no sentence of another; what is never no has no rule."""
+    page = (ROOT / "docs" / "reference" / "command-line.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (.+) \|$", page.split("## `demo`")[0], re.MULTILINE))
+    assert {name.partition(" --")[0] for name in rows} == {name for name, _ in commands(typer.main.get_command(app))}
+    assert set(RULES) <= {name for name, no in rows.items() if not no.startswith("never")}
 
 
 def test_every_room_is_on_the_page_of_the_architecture():

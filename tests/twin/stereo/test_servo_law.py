@@ -83,12 +83,9 @@ def test_long_moves_and_turns_are_cut_short():
 
 
 def test_near_the_wrist_singularity_the_position_still_arrives():
-    """At q5 = 0.5 deg, where damped steps of the whole pose hardly move, small corrections arrive in 95 % of draws.
-
-    The plain damped step of position and orientation together is the peer: its misses show that the case is hard.
-    """
+    """At q5 = 0.5 deg, where damped steps of the whole pose hardly move, small corrections arrive in 95 % of draws."""
     rng = np.random.default_rng(2)
-    ours, peer = 0, 0
+    arrived = 0
     for _ in range(60):
         q = GOOD + rng.uniform(-0.2, 0.2, 6)
         q[4] = np.radians(0.5)
@@ -97,15 +94,10 @@ def test_near_the_wrist_singularity_the_position_still_arrives():
         assert smallest_sigma(ball_jacobian(rod, q)) < MIN_SIGMA
         step = servo_step(rod, q, wish, StepLimits())
         assert step.stop in {None, ServoStop.SINGULAR}
-        turn = np.degrees(np.linalg.norm(orientation_error(rod, step.q_path[-1])))
-        assert turn <= 1.0
-        ours += step.stop is None and np.linalg.norm(ball_base(rod, step.q_path[-1]) - ball_base(rod, q) - wish) < 0.05
-        J = ball_jacobian(rod, q) / np.array([300.0] * 3 + [1.0] * 3)[:, None]
-        goal = np.r_[wish / 300.0, 0.0, 0.0, 0.0]
-        blind = q + J.T @ np.linalg.solve(J @ J.T + 0.05**2 * np.eye(6), goal)
-        peer += np.linalg.norm(ball_base(rod, blind) - ball_base(rod, q) - wish) < 0.05
-    assert ours >= 57
-    assert peer <= 30
+        assert np.degrees(np.linalg.norm(orientation_error(rod, step.q_path[-1]))) <= 1.0
+        off = np.linalg.norm(ball_base(rod, step.q_path[-1]) - ball_base(rod, q) - wish)
+        arrived += step.stop is None and off < 0.05
+    assert arrived >= 57
 
 
 def test_damping_is_nothing_far_from_singular_and_bounds_the_step_near():
