@@ -1,7 +1,6 @@
 """What a person looks at: map, scene, film, page; checked by geometry."""
 
 import json
-import os
 import re
 import shlex
 from dataclasses import replace
@@ -241,22 +240,6 @@ def test_the_scene_with_and_without_an_answer(anatomy, case, candidates, plan, t
     assert len(list(tmp_path.iterdir())) == 3
 
 
-@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
-def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
-    """The encoder is told how many threads it has: it does not take as many as there are cores."""
-    across = np.linspace(0, 255, film.WIDTH)[None, :, None] + rng.normal(0, 20, (film.HEIGHT, film.WIDTH, 3))
-    frames = [np.roll(np.clip(across, 0, 255).astype(np.uint8), 9 * k, axis=1) for k in range(12)]
-    cores = os.sched_getaffinity(0)
-    try:
-        for count in (1, len(cores)):
-            os.sched_setaffinity(0, sorted(cores)[:count])
-            size = film.WIDTH, film.HEIGHT
-            film.write_mp4(frames, size, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
-    finally:
-        os.sched_setaffinity(0, cores)
-    assert (tmp_path / "1.mp4").read_bytes() == (tmp_path / f"{len(cores)}.mp4").read_bytes()
-
-
 def test_a_film_of_which_frames_are_lost_is_no_film(tmp_path, rng, monkeypatch):
     """An encoder on a full disk ends without a word: what it left must not pass for the film."""
     frames, path = [rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)] * 7, tmp_path / "film.mp4"
@@ -274,18 +257,14 @@ def test_a_film_of_which_frames_are_lost_is_no_film(tmp_path, rng, monkeypatch):
     assert [one.name for one in tmp_path.iterdir()] == ["film.mp4"]
 
 
-@pytest.mark.parametrize(
-    ("bending", "breathing", "said"),
-    [
-        (None, None, "needle and tissue are rigid; nothing breathes; "),
-        ("declared", None, "tissue pushes on the needle: its end is bent, the drawing is straight; nothing breathes; "),
-        (None, "declared", "needle and tissue are rigid; the body is drawn still, as in the CT; "),
-    ],
-)
-def test_the_film_says_what_it_does_not_show(bending, breathing, said):
+def test_the_film_says_what_it_does_not_show():
     """Rigid where nothing else is declared; what is declared is computed, and drawn as if it were not."""
-    case = SimpleNamespace(bending=bending, breathing=breathing)
-    assert model_note(case) == said + "research software, not a medical device"
+    rigid, bent, breathes = (
+        model_note(SimpleNamespace(bending=a, breathing=b))
+        for a, b in zip((None, 1, None), (None, None, 1), strict=True)
+    )
+    assert rigid == "needle and tissue are rigid; nothing breathes; research software, not a medical device"
+    assert "its end is bent, the drawing is straight" in bent and "the body is drawn still, as in the CT" in breathes
 
 
 @pytest.mark.parametrize("total_s", [0.5, 5.0, 11.0, 31.0, 400.0])
