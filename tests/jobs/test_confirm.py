@@ -38,8 +38,8 @@ def context():
 
 @pytest.fixture(scope="module")
 def scanner(context):
-    """Of 140 mm of a patient, rotated by 3 degrees, the tip 4 mm off the target: slices are coarse."""
-    settings, rng = ScanSettings(3.0, 1.2, 15.0, length_mm=140.0, turn=np.radians(3.0)), np.random.default_rng(1)
+    """Of 120 mm of a patient, rotated by 3 degrees, the tip 4 mm off the target: slices are coarse."""
+    settings, rng = ScanSettings(3.0, 1.5, 15.0, length_mm=120.0, turn=np.radians(3.0)), np.random.default_rng(1)
     rod = TrueRod(context.case.target_ct + 4.0 * OUTWARD, -OUTWARD)
     return OneScan(case_scene(context.case, context.anatomy, settings, rng, needle=rod), settings, rng)
 
