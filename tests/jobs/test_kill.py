@@ -131,14 +131,6 @@ def test_a_command_killed_at_random(entry, world, tmp_path):
     kills(entry, entry, [[verb, case, *options] for case in world[1]], world[1], tmp_path / "out")
 
 
-@needs_time
-def test_search_killed_between_a_large_set_and_a_small_one(world, tmp_path):
-    """Certificate, pictures and page in turn with the table alone: none of the large set stays beside the small one."""
-    (large, small), options = world[1], ["--no-arm", "--certify", "--certify-size", "8"]
-    runs = [["search", large, *options], ["search", small, "--no-arm", "--no-pictures"]]
-    kills("search, large and small", "search", runs, world[1], tmp_path / "out")
-
-
 def two_of(folder_of, file, changes, here):
     """Two copies of an embedded folder whose case file differs by what is added or replaced."""
     for name, (old, new) in zip("ab", changes, strict=True):
