@@ -205,8 +205,8 @@ def test_the_cells_of_a_picture_are_those_of_its_directions(grid):
     case = world.make_case()
     found = world.make_candidates(case, step_deg=5.0, **grid)
     view = map_view(case, found)
-    rows = MapCells.of(found).picture(view, 101)
-    axis = (np.arange(101) + 0.5) / 101 * 2 - 1
+    rows = MapCells.of(found).picture(view, 61)
+    axis = (np.arange(61) + 0.5) / 61 * 2 - 1
     theta, beta = view.angles_at(np.stack(np.meshgrid(axis, -axis), axis=-1))
     assert (
         rows == MapCells.of(found).rows(theta, beta)
