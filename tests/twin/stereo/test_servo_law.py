@@ -318,7 +318,7 @@ def test_expected_error_is_the_error_that_comes():
     covariances = np.tile(np.diag([0.01, 0.04, 0.6]), (5, 1, 1))
     covariances[3] *= 9.0
     ours, plain, squared, truth = [], [], [], apply(T_TRUE, TARGETS)
-    for _ in range(500):
+    for _ in range(250):
         markers = seen(covariances, rng)
         read = MARKERS + rng.normal(0.0, 0.1, MARKERS.shape)
         found = map_head(NAMES, markers, read, 0.1, TARGETS, "mapping")
