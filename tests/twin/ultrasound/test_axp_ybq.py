@@ -118,6 +118,15 @@ def test_the_weights_are_the_spread_of_the_residuals(rng):
     np.testing.assert_allclose(np.cov(r.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03)
 
 
+def test_the_direction_is_the_mean_of_what_was_seen(rng):
+    """V = normalise(sum M_i^T v_i): exact without noise, and the image plane alone gives it up to its sign."""
+    exact, truth = simulate_recording(rng, 16, noise=None)
+    estimate = as_estimate(truth)
+    np.testing.assert_allclose(equation.mean_direction(estimate, exact), truth.direction_end2, atol=1e-12)
+    blind = equation.direction_from_plane(estimate, exact)
+    assert abs(blind @ truth.direction_end2) == pytest.approx(1, abs=1e-12)
+
+
 def test_an_unknown_pixel_size_is_found(rng):
     """3 % off: left alone the residuals carry it, estimated it is gone and both sizes are right; pixels need it."""
     recording, truth = simulate_recording(rng, 40)
