@@ -213,11 +213,14 @@ def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
     return np.array(tokens, dtype=np.str_)
 
 
-def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: str) -> NDArray[np.int64]:
-    """Triangles (m, 3) of polygons: each a fan from its first corner, which is exact for convex ones.
+def triangulate(
+    corners: NDArray[np.int64], counts: NDArray[np.int64], where: str, *, strips: bool = False
+) -> NDArray[np.int64]:
+    """Triangles (m, 3) of polygons: each a fan from its first corner, which is exact for convex ones; or of strips.
 
     Of the vertex indices of all polygons, one after the other, shape (k,), and how many each has, shape (p,), in all k.
-    Raises InputError: a polygon of fewer than three corners, or too many triangles.
+    In a strip every three corners that follow one another are a triangle, every second one seen from behind. Raises
+    InputError: a polygon of fewer than three corners, or too many triangles.
     """
     if len(counts) == 0:
         refuse("no face", where, "at least one triangle", "empty")
@@ -230,8 +233,10 @@ def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: st
     if total > MAX_TRIANGLES:
         refuse(f"{total} triangles", where, f"at most {MAX_TRIANGLES}", "too_many")
     start = np.repeat(np.cumsum(counts) - counts, counts - 2)
-    second = start + 1 + np.arange(total) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    return np.stack([corners[start], corners[second], corners[second + 1]], axis=1)
+    step = np.arange(total) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    odd = step % 2
+    first, second = (start + step + odd, start + step + 1 - odd) if strips else (start, start + step + 1)
+    return np.stack([corners[first], corners[second], corners[start + step + 2]], axis=1)
 
 
 def join(parts: list[RawMesh]) -> RawMesh:

@@ -93,16 +93,17 @@ def transform_text(T: Floats) -> str:
 MAX_PARTS = 20
 """A chain of registrations has a handful of parts."""
 ALLOWED = (
-    "an ITK transform file (.tfm, .h5) with one AffineTransform, Euler3DTransform or VersorRigid3DTransform of three "
-    "dimensions, as Slicer saves a linear transform, or a CompositeTransform of them"
+    "an ITK transform file (.tfm, .h5) with one AffineTransform, Euler3DTransform, VersorRigid3DTransform, "
+    "TranslationTransform or IdentityTransform of three dimensions, as Slicer saves a linear transform, or a "
+    "CompositeTransform of them"
 )
 _COMPOSITE = re.compile(r"CompositeTransform_(double|float)_3_3")
-_LINEAR = re.compile(
-    r"(AffineTransform|MatrixOffsetTransformBase|Euler3DTransform|VersorRigid3DTransform)_(double|float)_3_3"
-)
-_SIZES = {"Euler3DTransform": (6, (3, 4)), "VersorRigid3DTransform": (6, (3,))}
+_SIZES = {
+    "AffineTransform": (12, (3,)), "MatrixOffsetTransformBase": (12, (3,)), "Euler3DTransform": (6, (3, 4)),
+    "VersorRigid3DTransform": (6, (3,)), "TranslationTransform": (3, (0,)), "IdentityTransform": (0, (0,)),
+}  # fmt: skip
 """Parameters, and fixed parameters; Euler's flag for ZYX is missing in files of ITK 4."""
-_MATRIX_SIZES = (12, (3,))
+_LINEAR = re.compile(f"({'|'.join(_SIZES)})_(double|float)_3_3")
 _VERSOR_EDGE = 1e-10
 """ITK shortens a versor that is this near to length 1 or above; what it does to points is what a file means."""
 _VERSOR_SLACK = 1e-6
@@ -139,7 +140,7 @@ def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
 def _motion(stated: StatedTransform, where: str) -> Floats:
     """The motion of points by one part, shape (4, 4)."""
     name = stated.kind.partition("_")[0]
-    count, fixed_counts = _SIZES.get(name, _MATRIX_SIZES)
+    count, fixed_counts = _SIZES[name]
     for numbers, counts, key in zip((stated.parameters, stated.fixed), ((count,), fixed_counts), _KEYS, strict=True):
         if len(numbers) not in counts:
             allowed = " or ".join(f"{one}" for one in counts) + " numbers"
@@ -150,9 +151,9 @@ def _motion(stated: StatedTransform, where: str) -> Floats:
     elif name == "VersorRigid3DTransform":
         M = _versor(stated.parameters[:3], where)
     else:
-        M = stated.parameters[:9].reshape(3, 3)
-    centre = stated.fixed[:3]
-    return pose(M, stated.parameters[-3:] + centre - M @ centre)
+        M = stated.parameters[:9].reshape(3, 3) if count == 12 else np.eye(3)
+    shift, centre = np.append(np.zeros(3), stated.parameters)[-3:], np.append(stated.fixed, np.zeros(3))[:3]
+    return pose(M, shift + centre - M @ centre)
 
 
 def _about(axis: int, angle: float) -> Floats:

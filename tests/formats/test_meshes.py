@@ -56,6 +56,22 @@ def same_triangles(mesh: TriangleMesh, corners: np.ndarray, tolerance: float = 1
 # ---- whole files of each kind, and how they are written ------------------------------------------------------------
 
 
+def replaced(data: bytes, old: bytes, new: bytes) -> bytes:
+    assert old in data
+    return data.replace(old, new, 1)
+
+
+def obj_text(vertices: np.ndarray, polygons: list[list[int]]) -> bytes:
+    lines = [f"v {x} {y} {z}\n" for x, y, z in vertices]
+    return "".join([*lines, *(f"f {' '.join(f'{i + 1}//1' for i in one)}\n" for one in polygons)]).encode()
+
+
+def stl_text(triangles: np.ndarray) -> bytes:
+    corners = [[f"vertex {x} {y} {z}\n" for x, y, z in one] for one in triangles]
+    facets = [f"facet normal 0 0 0\nouter loop\n{''.join(one)}endloop\nendfacet\n" for one in corners]
+    return f"{''.join(facets)}endsolid\n".encode()
+
+
 def ply_mixed(vertices: np.ndarray, faces: list[list[int]], order: str = "<") -> bytes:
     name = {"<": "little", ">": "big"}[order]
     header = f"""ply\nformat binary_{name}_endian 1.0\ncomment made for a test\nelement vertex {len(vertices)}
@@ -117,8 +133,6 @@ FAN = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 1, 5], [1, 2, 3], [1, 3, 5]]
 
 def test_polygons_become_fans(tmp_path: Path) -> None:
     """Polygons of 3, 4 and 5 corners in one file: count - 2 triangles each, from the first corner."""
-    lines = [f"v {x} {y} {z}" for x, y, z in PENTAGON]
-    lines += ["f " + " ".join(f"{i + 1}//1" for i in polygon) + "\n" for polygon in POLYGONS]
     for suffix, data in (
         (".ply", ply_mixed(PENTAGON, POLYGONS)),
         (".ply", ply_mixed(PENTAGON, POLYGONS, ">")),
@@ -126,7 +140,7 @@ def test_polygons_become_fans(tmp_path: Path) -> None:
         (".vtk", vtk_model(PENTAGON, POLYGONS)),
         (".vtk", vtk_model(PENTAGON, POLYGONS, binary=False)),
         (".vtk", vtk_model(PENTAGON, POLYGONS, version="5.1")),
-        (".obj", "\n".join(lines).encode()),
+        (".obj", obj_text(PENTAGON, POLYGONS)),
     ):
         assert same_triangles(read(tmp_path, suffix, data), PENTAGON[FAN])
     two = read(tmp_path, ".vtp", vtp(PENTAGON, POLYGONS, pieces=2))
@@ -219,6 +233,69 @@ def test_fields_and_lines_beside_the_polygons_are_passed_over(tmp_path: Path) ->
     assert same_triangles(read(tmp_path, ".vtk", data), PENTAGON[FAN])
 
 
+STRIPPED = [[0, 1, 2], [2, 1, 3], [2, 3, 4], [3, 4, 5]]
+
+
+def test_strips_are_triangles_seen_from_both_sides_in_turn(tmp_path: Path) -> None:
+    """As VTK's stripper and Slicer's model maker write them, beside polygons or alone; the order is polygons first."""
+    strips = [[0, 1, 2, 3, 4], [3, 4, 5]]
+    for binary, version in ((True, "4.2"), (False, "4.2"), (True, "5.1")):
+        alone = vtk_model(PENTAGON, strips, binary=binary, version=version)
+        mesh = read(tmp_path, ".vtk", replaced(alone, b"POLYGONS", b"TRIANGLE_STRIPS"))
+        assert same_triangles(mesh, PENTAGON[STRIPPED])
+    text = vtk_model(PENTAGON, POLYGONS, binary=False)
+    both = replaced(text, b"\nCELL_DATA", b"TRIANGLE_STRIPS 1 5\n4 0 1 2 3\n\nCELL_DATA")
+    assert same_triangles(read(tmp_path, ".vtk", both), PENTAGON[FAN + STRIPPED[:2]])
+    piece = vtp(PENTAGON, strips, n_polys="0", n_strips="2").replace(b"Polys>", b"Strips>")
+    assert same_triangles(read(tmp_path, ".vtp", piece), PENTAGON[STRIPPED])
+
+
+def long_text(text: bytes) -> bytes:
+    """A text in a binary file of VTK, its length in two bytes."""
+    return (len(text) | 0x8000).to_bytes(2, "big") + text
+
+
+VTK_HEAD = b"# vtk DataFile Version 4.2\n"
+LEGAL = {
+    "vtk-small-letters": (".vtk", VTK_HEAD + vtk_model(PENTAGON, POLYGONS, binary=False)[len(VTK_HEAD) :].lower()),
+    "vtk-9-small-letters": (
+        ".vtk",
+        VTK_HEAD.replace(b"4.2", b"5.1")
+        + vtk_model(PENTAGON, POLYGONS, binary=False, version="5.1")[len(VTK_HEAD) :].lower(),
+    ),
+    "vtk-points-of-int": (".vtk", replaced(vtk_model(PENTAGON, POLYGONS, binary=False), b"6 float", b"6 int")),
+    "vtk-texts": (
+        ".vtk",
+        replaced(
+            vtk_model(PENTAGON, POLYGONS),
+            b"POINTS",
+            b"FIELD FieldData 1\nSPACE 1 2 string\n\xc3LPS" + long_text(b"POINTS" * 20) + b"\nPOINTS",
+        ),
+    ),
+    "ply-end-in-a-comment": (
+        ".ply",
+        replaced(ply_mixed(PENTAGON, POLYGONS), b"comment made", b"comment end_header\ncomment an end_header\ncomment"),
+    ),
+    "ply-comment-of-an-angstrom": (
+        ".ply",
+        replaced(ply_mixed(PENTAGON, POLYGONS), b"comment made", "comment by \u00c5sa, in \u00c5".encode()),
+    ),
+    "stl-endless-name": (".stl", b"solid " + b"name " * 2000 + b"\n" + stl_text(PENTAGON[FAN])),
+    "obj-curve": (
+        ".obj",
+        b"shadow_obj s.obj\ntrace_obj t.obj\nlod 3\nbevel on\nc_interp off\n" + obj_text(PENTAGON, POLYGONS)
+        + b"v 1 1 1\nv 2 2 2\nv 3 3 3\nv 4 4 4\ncstype rat bspline\ndeg 1\ncurv 0.0 1.0 -4 -3\nparm u 0 0 1 1\nend\n"
+        b"l 9 -1\np 9\n",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", LEGAL)
+def test_what_a_format_leaves_free_changes_nothing(tmp_path: Path, kind: str) -> None:
+    """Letters, types, comments, names and lines without a surface, as their formats allow them."""
+    assert same_triangles(read(tmp_path, *LEGAL[kind]), PENTAGON[FAN])
+
+
 def test_gltf_nodes_place_their_meshes(tmp_path: Path) -> None:
     """A mesh used twice: once moved by its parent, once turned, scaled and mirrored, where the winding turns too."""
     nodes = [
@@ -261,11 +338,6 @@ NAN = struct.pack("<f", np.nan)
 
 def patched(data: bytes, position: int, new: bytes) -> bytes:
     return data[:position] + new + data[position + len(new) :]
-
-
-def replaced(data: bytes, old: bytes, new: bytes) -> bytes:
-    assert old in data
-    return data.replace(old, new, 1)
 
 
 def broken_glb(**changes: Any) -> bytes:
@@ -374,7 +446,7 @@ BROKEN = [
     ("vtp-other-xml", ".vtp", b"<svg/>", "wrong_format"),
     ("vtp-other-vtk", ".vtp", replaced(VTP, b'"PolyData"', b'"ImageData"'), "wrong_format ImageData"),
     ("vtp-no-polygon", ".vtp", vtp(PENTAGON, POLYGONS, n_polys="0"), "empty"),
-    ("vtp-strips", ".vtp", vtp(PENTAGON, POLYGONS, n_strips="2"), "unsupported_feature"),
+    ("vtp-strips-missing", ".vtp", vtp(PENTAGON, POLYGONS, n_strips="2"), "wrong_count Strips"),
     ("vtp-points-too-many", ".vtp", vtp(PENTAGON, POLYGONS, n_points="7"), "size_mismatch 18 21"),
     ("vtp-points-huge", ".vtp", vtp(PENTAGON, POLYGONS, n_points="99999999999"), "too_many 99999999999"),
     ("vtp-polygons-too-many", ".vtp", vtp(PENTAGON, POLYGONS, "raw", n_polys="4"), "size_mismatch 24 32"),
@@ -400,12 +472,16 @@ BROKEN = [
     ("vtk-fewer-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 7"), "not_a_number"),
     ("vtk-more-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 4"), "size_mismatch 18 12"),
     ("vtk-huge", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 999999999999"), "out_of_range 999999999999"),
-    ("vtk-points-of-int", ".vtk", replaced(VTK, b"6 float", b"6 int"), "unknown_type"),
+    ("vtk-points-of-words", ".vtk", replaced(VTK, b"6 float", b"6 string"), "unknown_type"),
+    ("vtk-points-of-int", ".vtk", replaced(replaced(VTK, b"6 float", b"6 int"), b"15 10", b"15 10.5"), "not_a_number"),
+    ("vtk-word", ".vtk", replaced(VTK, b"15 10", b"wide 1"), "not_a_number"),
     ("vtk-index-too-high", ".vtk", vtk_model(PENTAGON, [[0, 1, 6]]), "index_out_of_range"),
     ("vtk-two-corners", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [0, 1]]), "wrong_count"),
     ("vtk-cells-too-many", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 4 15"), "file_cut"),
     ("vtk-cells-too-few", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 2 15"), "size_mismatch 10"),
-    ("vtk-strips", ".vtk", replaced(VTK, b"POLYGONS", b"TRIANGLE_STRIPS"), "unsupported_feature"),
+    ("vtk-strip-of-two-corners", ".vtk", replaced(vtk_model(PENTAGON, [[0, 1, 2], [0, 1]], binary=False), b"POLYGONS",
+     b"TRIANGLE_STRIPS"), "wrong_count"),
+    ("vtk-text-cut", ".vtk", vtk_model(PENTAGON, POLYGONS, extra="FIELD FieldData 1\nName 1 1 string\n?"), "file_cut"),
     ("vtk-9-offsets", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [], [3, 4, 5]], version="5.1"), "bad_offsets"),
     ("vtk-unknown-line", ".vtk", vtk_model(PENTAGON, POLYGONS, extra="SURPRISE 1\n"), "unknown_line SURPRISE"),
     ("vtp-entities", ".vtp", replaced(VTP, b"<VTKFile", b'<!DOCTYPE x [<!ENTITY a "b">]><VTKFile'), "xml_doctype"),

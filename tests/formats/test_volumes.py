@@ -15,7 +15,7 @@ from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.nifti_header import TYPES
 from puncture_twin.planning.formats.volumes.nrrd_header import TYPES as NRRD_TYPES
-from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, read_volume
+from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, data_file, read_volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
 
 SHAPE = (4, 5, 6)
@@ -128,6 +128,19 @@ def test_nrrd_says_its_space(tmp_path: Path) -> None:
         volume = read_volume(write(tmp_path, "a.nrrd", nrrd_bytes(("space:", f"space: {space}"))))
         assert place(volume.T_ct_index, 1, 2, 3) == [x, y, 42.0]
         assert np.array_equal(volume.values, VALUES)
+
+
+def test_data_beside_a_header_as_teem_names_them(tmp_path: Path) -> None:
+    """In this folder (``./``), and from the file's end (a skip of -1), which is all of it; one file for the case."""
+    write(tmp_path, "a.raw", VALUES.tobytes(order="F"))
+    stated = ("byte skip: -1", "data file: .//a.raw"), ("byte skip: 0", "data file: ././a.raw")
+    for skip, name in stated:
+        header = nrrd_bytes(("byte skip", skip), ("data file", name), data=b"")
+        path = write(tmp_path, "a.nhdr", header)
+        assert np.array_equal(read_volume(path).values, VALUES)
+        assert data_file(header, path) == "a.raw"
+    attached = write(tmp_path, "b.nrrd", nrrd_bytes(("byte skip", "byte skip: -1")))
+    assert np.array_equal(read_volume(attached).values, VALUES)
 
 
 def test_files_that_simpleitk_writes_come_back(tmp_path: Path) -> None:
@@ -319,6 +332,9 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "gz cut": ("a.nrrd", nrrd_bytes(GZIP, data=gzip.compress(bytes(range(240)))[:-9]), "file_damaged"),
     "gz bomb": ("a.nrrd", nrrd_bytes(GZIP, data=gzip.compress(bytes(30_000_000))), "size_mismatch"),
     "points at another folder": ("a.nhdr", nrrd_bytes(("data", "data file: ../a.raw"), data=b""), "outside_folder"),
+    "points out of here": ("a.nhdr", nrrd_bytes(("data", "data file: ./../a.raw"), data=b""), "outside_folder"),
+    "points at here": ("a.nhdr", nrrd_bytes(("data", "data file: ./."), data=b""), "outside_folder"),
+    "points at a list here": ("a.nhdr", nrrd_bytes(("data", "data file: ./LIST"), data=b""), "outside_folder"),
     "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "no_such_file"),
     "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "outside_folder"),
     "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "outside_folder"),
@@ -338,7 +354,16 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
     "unknown field": ("a.nrrd", nrrd_bytes(("surprise", "surprise: 1")), "unknown_line"),
     "field twice": ("a.nrrd", nrrd_bytes(("x", "Sizes: 4 5 6")), "duplicate_key"),
     "no byte order": ("a.nrrd", nrrd_bytes(("endian", None)), "missing_key"),
-    "skips": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: -1")), "unsupported_feature"),
+    "skips": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: 8"), data=bytes(248)), "unsupported_feature"),
+    "skips lines": ("a.nrrd", nrrd_bytes(("line skip", "line skip: -1")), "unsupported_feature"),
+    "skips to its end": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: -1"), data=bytes(241)), "size_mismatch"),
+    "skips to its end, cut": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: -1"), data=bytes(239)), "size_mismatch"),
+    "skips to its end, packed": (
+        "a.nrrd",
+        nrrd_bytes(("encoding", "encoding: gzip"), ("byte skip", "byte skip: -1"), data=gzip.compress(bytes(240))),
+        "unsupported_feature",
+    ),
+    "bzip2": ("a.nrrd", nrrd_bytes(("encoding", "encoding: bzip2")), "unsupported_feature"),
     "ascii": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1 " * 120), "unsupported_feature"),
     "several values per voxel": ("a.nrrd", nrrd_bytes(("kinds", "kinds: vector domain domain")), "unsupported_feature"),
     "two kinds": ("a.nrrd", nrrd_bytes(("kinds", "kinds: domain domain")), "unsupported_feature"),

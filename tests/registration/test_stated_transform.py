@@ -79,6 +79,18 @@ def test_it_is_an_input_and_says_that_nothing_is_known_of_its_error(tmp_path):
         registration_report(tmp_path)
 
 
+@pytest.mark.parametrize("ending", ["tfm", "h5"])
+def test_a_translation_and_an_identity_are_linear(tmp_path, ending):
+    """As ITK writes them, without a centre; alone, and as parts of a chain."""
+    shift = np.array([1.0, -2.0, 3.5])
+    moved, still = SimpleITK.TranslationTransform(3, shift), SimpleITK.Transform(3, SimpleITK.sitkIdentity)
+    path = tmp_path / f"ct_to_robot.{ending}"
+    for made, times in ((moved, 1.0), (still, 0.0), (SimpleITK.CompositeTransform([moved, still, moved]), 2.0)):
+        SimpleITK.WriteTransform(made, str(path))
+        assert np.array_equal(parse_transform(path.read_bytes(), path), pose(np.eye(3), times * shift))
+
+
+STILL = "#Insight Transform File V1.0\nTransform: IdentityTransform_double_3_3\nParameters:\nFixedParameters:\n"
 GOOD = transform_text(T_BASE_CT)
 MIRRORED = transform_text(T_BASE_CT @ np.diag([-1.0, 1.0, 1.0, 1.0]))
 BENT = transform_text(T_BASE_CT @ np.diag([1.001, 1.0, 1.0, 1.0]))
@@ -102,6 +114,9 @@ TWICE = GOOD + "\n".join(GOOD.splitlines()[1:]) + "\n"
         ("a.tfm", GOOD.replace("FixedParameters: 0", "FixedParameters: \uff11"), "not_a_number"),
         ("a.tfm", GOOD.replace("FixedParameters: 0", "FixedParameters: 1_0"), "not_a_number"),
         ("a.mat", GOOD, "unknown_format"),
+        ("a.tfm", STILL.replace("\nParameters:", "\nParameters: 1 2 3"), "wrong_count 3"),
+        ("a.tfm", STILL.replace("Identity", "Translation"), "wrong_count 0"),
+        ("a.tfm", STILL.replace("Identity", "Scale"), "unknown_type"),
     ],
 )
 def test_a_file_that_cannot_be_trusted_is_refused(tmp_path, name, text, says):

@@ -32,9 +32,16 @@ from puncture_twin.planning.formats.meshes.vtp import read_vtp
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up, to_lps
 
-_IGNORED = frozenset({"vt", "vn", "vp", "o", "g", "s", "mg", "usemtl", "mtllib", "l", "p", "usemap", "maplib"})
-"""Lines without a surface in them: texture, normals, names, groups, materials, polylines, points."""
-_ALLOWED = "lines v, f, and " + ", ".join(sorted(_IGNORED))
+_IGNORED = frozenset(
+    (
+        *("vt", "vn", "vp", "o", "g", "s", "mg", "usemtl", "mtllib", "usemap", "maplib", "shadow_obj", "trace_obj"),
+        *("bevel", "c_interp", "d_interp", "lod", "cstype", "deg", "bmat", "step", "ctech", "parm", "curv2", "end"),
+    )
+)
+"""Lines without a surface in them: texture, normals, names, groups, materials, drawing, numbers of curves."""
+_VERTEX_LISTS = {"f": 1, "l": 1, "p": 1, "curv": 3}
+"""Lines that name vertices, from which word on: faces, polylines, points, and curves after their range."""
+_ALLOWED = "lines v, f, l, p, curv, and " + ", ".join(sorted(_IGNORED))
 _STATED_COUNT = re.compile(r"#\s*faces\s*:\s*(\d+)|#\s*(\d+)\s+(?:faces|triangles)\b", re.IGNORECASE)
 _LAST_LINE = "\n# End of File"  # MeshLab writes it without a line end
 
@@ -46,20 +53,23 @@ def read_obj(data: bytes, where: str) -> RawMesh:
         what = "the last line has no line end: the file may be truncated"
         refuse(what, where, "a line end after every line", "file_cut")
     text = text.replace("\\\r\n", " ").replace("\\\n", " ")
-    vertices, corners, counts = list[tuple[float, float, float]](), list[int](), list[int]()
+    vertices, corners, counts, used = list[tuple[float, float, float]](), list[int](), list[int](), set[int]()
     for number, line in enumerate(text.split("\n"), start=1):
         tokens, place = line.split("#", 1)[0].split(), f"{where}, line {number}"
         if not tokens or tokens[0] in _IGNORED:
             continue
         if tokens[0] == "v":
             vertices.append(_vertex(tokens[1:], place))
-        elif tokens[0] == "f":
-            corners.extend(_corner(token, len(vertices), place) for token in tokens[1:])
-            counts.append(len(tokens) - 1)
+        elif tokens[0] in _VERTEX_LISTS:
+            named = [_corner(token, len(vertices), place) for token in tokens[_VERTEX_LISTS[tokens[0]] :]]
+            used.update(named)
+            if tokens[0] == "f":
+                corners += named
+                counts.append(len(named))
         else:
             refuse(f"line starts with {tokens[0][:20]!r}", place, _ALLOWED, "unknown_line")
     faces = triangulate(np.array(corners, dtype=np.int64), np.array(counts, np.int64), where)
-    if unused := len(vertices) - len(set(corners)):
+    if unused := len(vertices) - len(used):
         what = f"{unused} vertices are not used by any face: the face list may be truncated"
         allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
         refuse(what, where, allowed, "unused_vertices")
@@ -93,7 +103,7 @@ def _corner(token: str, n_vertices: int, where: str) -> int:
     return index - 1 if index > 0 else n_vertices + index
 
 
-_HEADER_BYTES = 84
+_HEADER_BYTES, MAX_NAME_BYTES = 84, 100_000
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _BINARY_ALLOWED = "a binary STL of 84 + 50 n bytes, n as its header states it, at least 1"
 _ASCII_ALLOWED = "one solid of complete facets, closed by endsolid"
@@ -109,7 +119,8 @@ def read_stl(data: bytes, where: str) -> RawMesh:
     """The triangles of an STL file, three vertices of their own each."""
     stated = int.from_bytes(data[80:84], "little")
     needed = _HEADER_BYTES + 50 * stated
-    looks_ascii = data[:512].lstrip().lower().startswith(b"solid") and b"facet" in data[:2048].lower()
+    name = re.match(rb"\s*solid[^\r\n]*", data[:MAX_NAME_BYTES], re.IGNORECASE)
+    looks_ascii = name is not None and b"facet" in data[: name.end() + 2048].lower()
     if looks_ascii and (len(data) < _HEADER_BYTES or len(data) != needed):
         return _read_ascii(data, where)
     if len(data) < _HEADER_BYTES:

@@ -4,6 +4,7 @@ The numbers of an ASCII file are turned into a binary body of doubles, so that o
 Source: G. Turk, "The PLY Polygon File Format", 1994.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ _TYPES = {
 }
 _FORMATS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-_MAX_HEADER_BYTES = 100_000
+_HEADER_END, _MAX_HEADER_BYTES = re.compile(rb"^[ \t]*end_header[ \t\r]*\n", re.MULTILINE), 100_000
 _MAX_ROWS = 2**40
 """Beyond any file; keeps the size arithmetic exact."""
 _ALLOWED = "a PLY header (ply, format, element, property, end_header) and exactly the data that it states"
@@ -83,16 +84,15 @@ def read_ply(data: bytes, where: str) -> RawMesh:
 
 def _split(data: bytes, where: str) -> tuple[list[_Element], bytes]:
     """The elements that the header states, and their data, in binary."""
-    end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
-    line_end = data.find(b"\n", end)
-    if not data.startswith(b"ply") or end < 0 or line_end < 0:
+    end = _HEADER_END.search(data, 0, _MAX_HEADER_BYTES)
+    if not data.startswith(b"ply") or end is None:
         refuse("no complete header", where, _ALLOWED, "bad_header")
-    lines = [line.split() for line in data[:end].decode("latin-1").splitlines()]
+    lines = [line.decode("latin-1").split() for line in data[: end.start()].splitlines()]
     lines = [line for line in lines if line and line[0] not in ("comment", "obj_info")]
     formats = [line[1] for line in lines if line[0] == "format" and len(line) == 3]
     if lines[0] != ["ply"] or len(formats) != 1 or formats[0] not in _FORMATS:
         refuse(f"format {formats}", where, "one of " + ", ".join(_FORMATS), "unsupported_feature")
-    is_ascii, body = formats[0] == "ascii", data[line_end + 1 :]
+    is_ascii, body = formats[0] == "ascii", data[end.end() :]
     elements = _elements(lines, _FORMATS[formats[0]], is_ascii=is_ascii, where=where)
     if not is_ascii:
         return elements, body

@@ -23,7 +23,8 @@ _TYPES = {
     "float": ">f4", "double": ">f8",
 }  # fmt: skip
 """By their names in lower case, as stored in a binary file."""
-_CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
+_SURFACES = ("POLYGONS", "TRIANGLE_STRIPS")
+_CELLS = ("VERTICES", "LINES", *_SURFACES)
 _OFFSETS_SINCE = 5
 """The major version from which on cells are offsets and connectivity."""
 _DATA = ("POINT_DATA", "CELL_DATA")
@@ -38,9 +39,9 @@ class _Polygons(NamedTuple):
 
 
 def read_vtk(data: bytes, where: str) -> RawMesh:
-    """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface.
+    """The polygons and triangle strips of a legacy VTK file; polygons become fans; lines and lone points no surface.
 
-    Raises InputError: it is cut, of another kind, has fewer numbers than it states, or holds triangle strips.
+    Raises InputError: it is cut, of another kind, or has fewer numbers than it states.
     """
     cursor = _Cursor(data, where)
     version = _VERSION.fullmatch(cursor.line())
@@ -53,20 +54,16 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
         refuse("the data set is not POLYDATA", where, _ALLOWED, "wrong_format")
     offsets = int(version[1]) >= _OFFSETS_SINCE
     points: NDArray[np.float64] | None = None
-    polygons: _Polygons | None = None
-    while (words := cursor.words()) and words[0].upper() not in _DATA:
-        key = words[0].upper()
+    surfaces: dict[str, _Polygons] = {}
+    while (words := cursor.words()) and words[0] not in _DATA:
+        key = words[0]
         if key == "POINTS" and points is None:
-            count, kind = _count(words, 1, MAX_VERTICES, where), words[2].lower() if len(words) == 3 else ""
-            if kind not in ("float", "double"):
-                refuse(f"points of type {kind[:20]!r}", where, "float, double", "unknown_type")
+            count, kind = _count(words, 1, MAX_VERTICES, where), words[2] if len(words) == 3 else ""
             points = cursor.numbers(3 * count, kind).astype(np.float64).reshape(-1, 3)
         elif key in _CELLS:
             cells = _cells(cursor, words, offsets=offsets, where=where)
-            if key == "TRIANGLE_STRIPS" and len(cells.counts):
-                refuse("triangle strips", where, "polygons", "unsupported_feature")
-            if key == "POLYGONS" and polygons is None:
-                polygons = cells
+            if key in _SURFACES and len(cells.counts):
+                surfaces.setdefault(key, cells)
         elif key == "METADATA":  # information about arrays, which ends with an empty line
             while cursor.line().strip():
                 pass
@@ -74,12 +71,14 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
             _pass_over(cursor, words, where)
         else:
             refuse(f"unknown line {' '.join(words)[:60]!r}", where, _ALLOWED, "unknown_line")
-    if points is None or polygons is None or not len(polygons.counts):
+    if points is None or not surfaces:
         refuse("no points or no polygons: the file is truncated, or has no surface", where, _ALLOWED, "empty")
-    if polygons.corners.min() < 0 or polygons.corners.max() >= len(points):
-        what = f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}"
+    corners = np.concatenate([cells.corners for cells in surfaces.values()])
+    if corners.min() < 0 or corners.max() >= len(points):
+        what = f"vertex indices {corners.min()} to {corners.max()}"
         refuse(what, where, f"0 to {len(points) - 1}", "index_out_of_range")
-    return RawMesh(points, triangulate(polygons.corners, polygons.counts, where))
+    parts = [triangulate(*cells, where, strips=key != _SURFACES[0]) for key, cells in surfaces.items()]
+    return RawMesh(points, np.concatenate(parts))
 
 
 def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _Polygons:
@@ -120,8 +119,8 @@ def _pass_over(cursor: _Cursor, words: list[str], where: str) -> None:
         if len(array) != 4:
             refuse(f"field array {' '.join(array)[:60]!r}", where, _ALLOWED, "unknown_line")
         count = _count(array, 1, 1000, where) * _count(array, 2, 3 * MAX_VERTICES, where)
-        if array[3] == "string" and cursor.is_ascii:
-            _ = [cursor.words() for _line in range(min(count, 1000))]
+        if array[3] == "STRING":
+            _ = [cursor.words() if cursor.is_ascii else cursor.text() for _text in range(min(count, 1000))]
         else:
             cursor.numbers(count, array[3])
 
@@ -150,10 +149,10 @@ class _Cursor:
         return line.rstrip(b"\r")
 
     def words(self) -> list[str]:
-        """Words of the next line that is not empty; none at the end of the file."""
+        """Words of the next line that is not empty, in capitals, as VTK tells no case; none at the end of the file."""
         while self._at < len(self._data):
             if line := self.line().strip():
-                return line.decode("ascii", "replace").split()
+                return line.decode("ascii", "replace").upper().split()
         return []
 
     def numbers(self, count: int, kind: str) -> NDArray[Any]:
@@ -171,12 +170,21 @@ class _Cursor:
         self._at += size
         return values
 
+    def text(self) -> bytes:
+        """The next text of a binary file: the first two bits say of how many bytes, 8 to 1, its length is."""
+        size = 8 >> (self._data[self._at] >> 6) if self._at < len(self._data) else 8
+        length = int.from_bytes(self._data[self._at : self._at + size], "big") & (1 << 8 * size - 2) - 1
+        start, self._at = self._at + size, self._at + size + length
+        if self._at > len(self._data):
+            refuse("a text does not fit into the file: it is truncated", self._where, _ALLOWED, "file_cut")
+        return self._data[start : self._at]
+
     def named_numbers(self, key: str, count: int) -> NDArray[Any]:
         """The numbers of an array with a line of its own: its name and type."""
         words = self.words()
-        if len(words) != 2 or words[0].upper() != key:
+        if len(words) != 2 or words[0] != key:
             refuse(f"{' '.join(words)[:60]!r} instead of {key}", self._where, _ALLOWED, "unknown_line")
-        if words[1].lower() in ("float", "double"):
+        if words[1] in ("FLOAT", "DOUBLE"):
             refuse(f"{key} of type {words[1]}", self._where, "whole numbers", "wrong_type")
         return self.numbers(count, words[1])
 

@@ -30,9 +30,9 @@ _HEADER_TYPES = {"UInt32": "u4", "UInt64": "u8"}
 
 
 def read_vtp(data: bytes, where: str) -> RawMesh:
-    """The polygons of a VTP file; polygons are cut into fans; points and lines in it carry no surface.
+    """The polygons and triangle strips of a VTP file; polygons are cut into fans; points and lines carry no surface.
 
-    Raises InputError: it is cut, an array is shorter or longer than stated, or it holds triangle strips.
+    Raises InputError: it is cut, or an array is shorter or longer than stated.
     """
     written, appended = _split_appended(data, where)
     if b"<!" in written.replace(b"<!--", b""):
@@ -86,32 +86,39 @@ def _split_appended(data: bytes, where: str) -> tuple[bytes, bytes]:
 
 def _piece(piece: ElementTree.Element, encoding: Encoding, where: str) -> RawMesh | None:
     """One piece; None if it states no polygon at all, as empty pieces of a parallel writer do."""
-    if _stated(piece, "NumberOfStrips", where):
-        refuse("triangle strips", where, "polygons", "unsupported_feature")
-    n_polygons = _stated(piece, "NumberOfPolys", where)
-    if n_polygons == 0:
+    counts = {name: _stated(piece, f"NumberOf{name}", where) for name in ("Polys", "Strips")}
+    if not any(counts.values()):
         return None
     n_points = _stated(piece, "NumberOfPoints", where)
-    if n_points > MAX_VERTICES or n_polygons > MAX_TRIANGLES:
-        what = f"{n_points} points and {n_polygons} polygons"
+    if n_points > MAX_VERTICES or max(counts.values()) > MAX_TRIANGLES:
+        what = f"{n_points} points and {max(counts.values())} polygons"
         refuse(what, where, f"at most {MAX_VERTICES} points and {MAX_TRIANGLES} polygons", "too_many")
     points = _values(piece, "Points/DataArray", 3 * n_points, encoding, where)
     components = _one(piece, "Points/DataArray", where).get("NumberOfComponents")
     if components != "3":
         refuse(f"points with {components} components", where, "3", "wrong_shape")
-    offsets = _whole(piece, "offsets", n_polygons, encoding, where)
+    faces = [_triangles(piece, name, count, n_points, encoding, where) for name, count in counts.items() if count]
+    return RawMesh(points.reshape(-1, 3).astype(np.float64), np.concatenate(faces))
+
+
+def _triangles(
+    piece: ElementTree.Element, cells: str, count: int, n_points: int, encoding: Encoding, where: str
+) -> NDArray[np.int64]:
+    """The triangles (m, 3) of so many cells of a kind, ``Polys`` or ``Strips``."""
+    offsets = _whole(piece, cells, "offsets", count, encoding, where)
     if offsets.min() < 3 or offsets.max() > MAX_VERTICES or (np.diff(offsets) < 3).any():
         refuse("offsets do not rise by 3 or more per polygon", where, _ALLOWED, "bad_offsets")
-    counts = np.diff(offsets, prepend=0)
-    corners = _whole(piece, "connectivity", int(offsets[-1]), encoding, where)
+    corners = _whole(piece, cells, "connectivity", int(offsets[-1]), encoding, where)
     if corners.min() < 0 or corners.max() >= n_points:
         what = f"vertex indices {corners.min()} to {corners.max()}"
         refuse(what, where, f"0 to {n_points - 1}", "index_out_of_range")
-    return RawMesh(points.reshape(-1, 3).astype(np.float64), triangulate(corners, counts, where))
+    return triangulate(corners, np.diff(offsets, prepend=0), where, strips=cells == "Strips")
 
 
-def _whole(piece: ElementTree.Element, name: str, count: int, encoding: Encoding, where: str) -> NDArray[np.int64]:
-    values = _values(piece, f"Polys/DataArray[@Name='{name}']", count, encoding, where)
+def _whole(
+    piece: ElementTree.Element, cells: str, name: str, count: int, encoding: Encoding, where: str
+) -> NDArray[np.int64]:
+    values = _values(piece, f"{cells}/DataArray[@Name='{name}']", count, encoding, where)
     if values.dtype.kind not in "iu":
         refuse(f"{name} of type {values.dtype}", where, "whole numbers", "wrong_type")
     return values.astype(np.int64)

@@ -62,7 +62,7 @@ def split_header(content: bytes, path: Path) -> NrrdText:
             refuse(f"the field {field!r} appears twice", where, "each field once", "duplicate_key")
         fields[key] = value.strip()
     if "datafile" in fields:
-        name = fields["datafile"]
+        name = re.sub(r"^(\./+)+", "", fields["datafile"])  # as teem writes it
         allowed = "the name of one file in the same folder"
         if not name or re.search(r"[/\\%\0]|[^\S ]", name) or name in (".", "..") or name.upper().startswith("LIST"):
             refuse(f"data file {name[:80]!r}", path, allowed, "outside_folder")
@@ -234,13 +234,14 @@ def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
 
 def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
     fields = raw.fields
-    for key in ("byteskip", "lineskip"):
-        if fields.get(key, "0") != "0":
-            refuse(f"{key} {fields[key]!r}", path, "0", "unsupported_feature")
     stated = stated_field(fields, "encoding", path).lower()
     encoding = "gzip" if stated in GZIP else stated
     if encoding not in {"raw", "gzip"}:
         refuse(f"encoding {stated!r}", path, "raw, gzip", "unsupported_feature")
+    skips = {"byteskip": ("0", "-1") if encoding == "raw" else ("0",), "lineskip": ("0",)}
+    for key, allowed in skips.items():  # -1: the data are the file's last bytes, which all of them must be anyway
+        if fields.get(key, "0") not in allowed:
+            refuse(f"{key} {fields[key]!r}", path, " or ".join(allowed), "unsupported_feature")
     name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
         refuse(f"type {fields['type']!r}", path, "an integer type, float or double", "unknown_type")
