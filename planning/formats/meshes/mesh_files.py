@@ -103,7 +103,8 @@ def _corner(token: str, n_vertices: int, where: str) -> int:
     return index - 1 if index > 0 else n_vertices + index
 
 
-_HEADER_BYTES, MAX_NAME_BYTES = 84, 100_000
+_HEADER_BYTES = 84
+_MAX_NAME_BYTES = 100_000
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _BINARY_ALLOWED = "a binary STL of 84 + 50 n bytes, n as its header states it, at least 1"
 _ASCII_ALLOWED = "one solid of complete facets, closed by endsolid"
@@ -119,7 +120,7 @@ def read_stl(data: bytes, where: str) -> RawMesh:
     """The triangles of an STL file, three vertices of their own each."""
     stated = int.from_bytes(data[80:84], "little")
     needed = _HEADER_BYTES + 50 * stated
-    name = re.match(rb"\s*solid[^\r\n]*", data[:MAX_NAME_BYTES], re.IGNORECASE)
+    name = re.match(rb"\s*solid[^\r\n]*", data[:_MAX_NAME_BYTES], re.IGNORECASE)
     looks_ascii = name is not None and b"facet" in data[: name.end() + 2048].lower()
     if looks_ascii and (len(data) < _HEADER_BYTES or len(data) != needed):
         return _read_ascii(data, where)
