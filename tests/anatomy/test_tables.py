@@ -108,6 +108,17 @@ def test_a_table_that_only_a_head_touches_is_cut_off_and_may_be_all_that_the_bod
     assert [side.face for side in found.sides] == sides
 
 
+@pytest.mark.parametrize("phantom", [False, True])
+def test_a_table_apart_from_a_body_of_one_section_is_not_stated(phantom):
+    """No side is one without the key; with it all four are, since one of them may be, and each says to leave it out."""
+    inside = np.minimum(140.0 - np.abs(X - 198.0), 90.0 - np.abs(Y - 130.0)) > 0.0
+    scene = noisy(np.where(inside | ((Y > 250.0) & (Y < 280.0)), 500.0, -500.0))
+    stated, left_out = (touching_tables(scene, inside, SPACING, Shown(phantom, table=one)) for one in ("present", None))
+    assert left_out.sides == () and not left_out.cut_off.any() and len(left_out.warnings) == (not phantom)
+    assert len(stated.sides) == len(stated.warnings) == 4
+    assert all("leave the key out if none does" in said for said in stated.warnings)
+
+
 def test_the_top_of_a_table_beside_the_body_is_no_support():
     """Seen from the front a table's top lies behind the body's middle; the side it is on is the back."""
     inside = trunk() > 0.0

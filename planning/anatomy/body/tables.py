@@ -42,12 +42,13 @@ CUT_OFF = (
 )
 TOUCHES = (
     "the body ends in one section along the bed at its {name} side, over {width:.0f} mm, like a table or board: the "
-    "space beyond it does not count as free ([ct] table = {overrule})"
+    "space beyond it does not count as free ([ct] table{overrule})"
 )
-NO_TABLE, NO_OTHER = '"none" if there is none', '"present" if what was removed is all that the body lies on'
+NO_TABLE, NO_OTHER = ' = "none" if there is none', ' = "present" if what was removed is all that the body lies on'
+NOT_TOUCHING = ' = "present" is for a table that touches the body: leave the key out if none does, then no side is one'
 PRISM = (
     "the body has a constant section along the bed at all four sides, like a phantom: no side counts as a table "
-    '([ct] table = "present" if one is; region = "phantom" if it is a whole phantom)'
+    '([ct] table = "present" if one touches it; region = "phantom" if it is a whole phantom)'
 )
 
 Face = tuple[int, int]
@@ -127,12 +128,13 @@ def touching_tables(
             cut_off |= table
         elif side.firm or not any(one.firm for one in drawn):  # beside a table straight flanks are none
             left.append(side)
-    prism = len(drawn) == len(FACES)
-    if prism and not shown.phantom and shown.table != "present":
+    prism, present = len(drawn) == len(FACES), shown.table == "present"
+    own = prism or shown.phantom  # its sides are its own, unless a person says that it lies on a table
+    if prism and not (shown.phantom or present):
         said.append(PRISM)
-    if cut_off.any() if shown.table == "present" else prism or shown.phantom:
+    if cut_off.any() if present else own:
         left = []
-    overrule = NO_OTHER if cut_off.any() else NO_TABLE
+    overrule = NO_OTHER if cut_off.any() else NOT_TOUCHING if own else NO_TABLE
     said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm, overrule=overrule) for side in left]
     if (length_mm := trunk.shape[2] * float(spacing_mm[2])) < LEAST_LENGTH_MM:
         said.append(TOO_SHORT.format(length=length_mm))
