@@ -272,6 +272,16 @@ LEGAL = {
             b"FIELD FieldData 1\nSPACE 1 2 string\n\xc3LPS" + long_text(b"POINTS" * 20) + b"\nPOINTS",
         ),
     ),
+    "vtk-notes-and-types": (
+        ".vtk",
+        replaced(
+            vtk_model(PENTAGON, POLYGONS),
+            b"POINTS",
+            b"FIELD FieldData 3\nids 1 2 vtkIdType\n\0\0\0\1\0\0\0\2\nMETADATA\nCOMPONENT_NAMES\nid\n\n\n"
+            b"INFORMATION 1\nNAME L2_NORM_RANGE LOCATION vtkDataArray\nDATA 2 0 1\n\nbig 1 1 vtktypeuint64\n"
+            b"POLYGONS\nsmall 1 1 signed_char\n\x80\nMETADATA\nINFORMATION 0\n\nPOINTS",
+        ),
+    ),
     "ply-end-in-a-comment": (
         ".ply",
         replaced(ply_mixed(PENTAGON, POLYGONS), b"comment made", b"comment end_header\ncomment an end_header\ncomment"),

@@ -18,13 +18,14 @@ from puncture_twin.planning.formats.guard import MAX_TOKEN_LENGTH, MAX_TRIANGLES
 _ALLOWED = "a legacy VTK file, ASCII or BINARY, of DATASET POLYDATA whose points and polygons are as many as it states"
 _VERSION = re.compile(rb"# vtk DataFile Version ([1-5])\.\d\s*")
 _TYPES = {
-    "unsigned_char": ">u1", "char": ">i1", "unsigned_short": ">u2", "short": ">i2", "unsigned_int": ">u4",
-    "int": ">i4", "unsigned_long": ">u8", "long": ">i8", "vtkidtype": ">i8", "vtktypeint64": ">i8",
-    "float": ">f4", "double": ">f8",
+    "unsigned_char": ">u1", "char": ">i1", "signed_char": ">i1", "unsigned_short": ">u2", "short": ">i2",
+    "unsigned_int": ">u4", "int": ">i4", "unsigned_long": ">u8", "long": ">i8", "vtkidtype": ">i4",
+    "vtktypeint64": ">i8", "vtktypeuint64": ">u8", "float": ">f4", "double": ">f8",
 }  # fmt: skip
 """By their names in lower case, as stored in a binary file."""
 _SURFACES = ("POLYGONS", "TRIANGLE_STRIPS")
 _CELLS = ("VERTICES", "LINES", *_SURFACES)
+_NOTES = ("METADATA", "INFORMATION")
 _OFFSETS_SINCE = 5
 """The major version from which on cells are offsets and connectivity."""
 _DATA = ("POINT_DATA", "CELL_DATA")
@@ -64,9 +65,6 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
             cells = _cells(cursor, words, offsets=offsets, where=where)
             if key in _SURFACES and len(cells.counts):
                 surfaces.setdefault(key, cells)
-        elif key == "METADATA":  # information about arrays, which ends with an empty line
-            while cursor.line().strip():
-                pass
         elif key == "FIELD":
             _pass_over(cursor, words, where)
         else:
@@ -149,10 +147,16 @@ class _Cursor:
         return line.rstrip(b"\r")
 
     def words(self) -> list[str]:
-        """Words of the next line that is not empty, in capitals, as VTK tells no case; none at the end of the file."""
+        """Words of the next line that is not empty, in capitals, as VTK tells no case; none at the end of the file.
+
+        What is noted of an array is passed over: it ends with an empty line.
+        """
         while self._at < len(self._data):
-            if line := self.line().strip():
-                return line.decode("ascii", "replace").upper().split()
+            words = self.line().decode("ascii", "replace").upper().split()
+            if words and words[0] not in _NOTES:
+                return words
+            while words and self.line().strip():
+                pass
         return []
 
     def numbers(self, count: int, kind: str) -> NDArray[Any]:
