@@ -110,6 +110,8 @@ TYPES = {
     "float": "f4",
     "double": "f8",
 }
+SKIPS = {"byteskip": ("0", "-1"), "lineskip": ("0",)}
+"""-1: the data are the file's last bytes, which here all of them must be: after a cut others would be the last."""
 GZIP = frozenset(("gzip", "gz"))
 AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
 """What an axis may be that runs through space; others (vector, list, color) hold several values per voxel."""
@@ -234,14 +236,13 @@ def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
 
 def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
     fields = raw.fields
+    for key, allowed in SKIPS.items():
+        if fields.get(key, "0") not in allowed:
+            refuse(f"{key} {fields[key]!r}", path, " or ".join(allowed), "unsupported_feature")
     stated = stated_field(fields, "encoding", path).lower()
     encoding = "gzip" if stated in GZIP else stated
     if encoding not in {"raw", "gzip"}:
         refuse(f"encoding {stated!r}", path, "raw, gzip", "unsupported_feature")
-    skips = {"byteskip": ("0", "-1") if encoding == "raw" else ("0",), "lineskip": ("0",)}
-    for key, allowed in skips.items():  # -1: the data are the file's last bytes, which all of them must be anyway
-        if fields.get(key, "0") not in allowed:
-            refuse(f"{key} {fields[key]!r}", path, " or ".join(allowed), "unsupported_feature")
     name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
         refuse(f"type {fields['type']!r}", path, "an integer type, float or double", "unknown_type")
