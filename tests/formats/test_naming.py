@@ -181,6 +181,11 @@ def test_common_tables_are_read(file: str, text: str) -> None:
     assert parse_names(text.encode(), Path(file)) == READ
 
 
+def test_an_apostrophe_in_a_colour_table_is_part_of_a_name() -> None:
+    text = "# Color table\n1 Meckel's_cave 1 2 3 255\n2 \"Broca's area\" 1 2 3 255\n3 a\\b 1 2 3 255\n"
+    assert parse_names(text.encode(), Path("a.ctbl")) == {1: "Meckel's_cave", 2: "Broca's area", 3: "a\\b"}
+
+
 @pytest.mark.parametrize(
     ("file", "text", "match"),
     [

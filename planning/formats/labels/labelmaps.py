@@ -15,7 +15,6 @@ tables of 3D Slicer.
 import csv
 import io
 import re
-import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -333,14 +332,11 @@ def _list_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     for line, text in enumerate(decode_text(data, str(path)).splitlines(), start=1):
         if not text.strip() or text.lstrip().startswith("#"):
             continue
-        where, fields, said = f"{path}, line {line}", [], ""
-        try:
-            fields = shlex.split(text)
-        except ValueError as error:
-            said = f" ({error})"
+        where, closed = f"{path}, line {line}", text.count('"') % 2 == 0  # an apostrophe is no quotation mark
+        fields = [one.strip('"') for one in re.findall(r'"[^"]*"|[^\s"]+', text)] if closed else []
         numbers = [re.fullmatch(r"\d+(\.\d*)?|\.\d+", one) is not None for one in fields]
         if not {8: all(numbers[:7]), 6: all(numbers[2:])}.get(len(fields), False):
-            refuse(f"{text[:60]!r}{said}", where, ALLOWED_LIST, "unknown_line")
+            refuse(f"{text[:60]!r}", where, ALLOWED_LIST, "unknown_line")
         yield _Entry(fields[0], fields[7] if len(fields) == 8 else fields[1], where)
 
 
