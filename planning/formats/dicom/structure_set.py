@@ -116,8 +116,8 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
         parts = bytes(stored or b"").rstrip(b" \0").split(b"\\")
         flat = np.array(parts, dtype=np.float64) if parts != [b""] else np.zeros(0)
     count = len(flat) // 3
-    if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
-        allowed = "three finite numbers for each of at least three points"
+    if len(flat) != 3 * count or not 1 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
+        allowed = "three finite numbers for each of its points"
         refuse(f"{dicom_file.name('ContourData')} has {len(flat)} numbers", label, allowed, "wrong_count")
     if "NumberOfContourPoints" in item:
         dicom_file.whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
