@@ -290,6 +290,10 @@ LEGAL = {
         ".ply",
         replaced(ply_mixed(PENTAGON, POLYGONS), b"comment made", "comment by \u00c5sa, in \u00c5".encode()),
     ),
+    "stl-byte-order-mark": (
+        ".stl",
+        "\ufeffsolid K\u00f6rper\r\n".encode() + stl_text(PENTAGON[FAN]).replace(b"\n", b"\r\n"),
+    ),
     "stl-endless-name": (".stl", b"solid " + b"name " * 2000 + b"\n" + stl_text(PENTAGON[FAN])),
     "obj-curve": (
         ".obj",

@@ -114,6 +114,9 @@ def make_meshes(folder):
     (folder / "ascii.vtp").write_bytes(vtp(mesh.vertices, mesh.faces.tolist()))
     (folder / "base64.vtp").write_bytes(vtp(mesh.vertices, mesh.faces.tolist(), "binary", compressed=True))
     (folder / "a.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces))
+    noted = "FIELD FieldData 1\nname 1 1 string\n\x7fMETADATA\nINFORMATION 0\n\n"
+    stripped = vtk_model(mesh.vertices, mesh.faces, extra=noted).replace(b"\x7f", b"\xc5liver\n")
+    (folder / "strips.vtk").write_bytes(stripped.replace(b"POLYGONS", b"triangle_strips"))
     (folder / "ascii.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces, binary=False))
 
 

@@ -185,7 +185,14 @@ def read_transform(path):
 
 
 TEXTS = ("ascii.stl", "a.obj", "ascii.ply", "ascii.vtp", "base64.vtp", "ascii.vtk")
-MESHES = {"a.stl": "stl", "a.ply": "headed", "a.glb": "glb", "a.vtk": "headed", **dict.fromkeys(TEXTS, "text")}
+MESHES = {
+    "a.stl": "stl",
+    "a.ply": "headed",
+    "a.glb": "glb",
+    "a.vtk": "headed",
+    "strips.vtk": "headed",
+    **dict.fromkeys(TEXTS, "text"),
+}
 HEADED = ("raw.nrrd", "gzip.nrrd", "labels.seg.nrrd")
 LABELS = {"labels.nii.gz": "gzip", "labels.nii": "nifti", "labels.nhdr": "text", **dict.fromkeys(HEADED, "headed")}
 POINTS = {"a.mrk.json": "tree", **dict.fromkeys(("markers_ct.csv", "kinds.csv", "a.fcsv"), "table")}

@@ -120,7 +120,7 @@ def read_stl(data: bytes, where: str) -> RawMesh:
     """The triangles of an STL file, three vertices of their own each."""
     stated = int.from_bytes(data[80:84], "little")
     needed = _HEADER_BYTES + 50 * stated
-    name = re.match(rb"\s*solid[^\r\n]*", data[:_MAX_NAME_BYTES], re.IGNORECASE)
+    name = re.match(rb"(?:\xef\xbb\xbf)?\s*solid[^\r\n]*", data[:_MAX_NAME_BYTES], re.IGNORECASE)
     looks_ascii = name is not None and b"facet" in data[: name.end() + 2048].lower()
     if looks_ascii and (len(data) < _HEADER_BYTES or len(data) != needed):
         return _read_ascii(data, where)
