@@ -49,7 +49,8 @@ class StructureSources:
         self._volumes: dict[str, VolumeSurfaces] = {}
         self._imaged: dict[tuple[str, int | None], Imaged] = {}
         self.ends: dict[str, LabelEnds] = {}
-        """Of the labels in each label map and mask that was read, by its name as the case writes it."""
+        """Of the labels in each label map and mask that was read, by its name as the case writes it. But the skin's: a
+        body that goes on says nothing of where the organs in it were searched."""
         self.warnings: list[str] = []
         self.ignored: list[str] = []
 
@@ -193,7 +194,9 @@ class StructureSources:
         if not known:
             self._check_grid(volume.source.grid, name)
             present = volume.present()
-            self.ends[name] = present.ends
+            skin = self._case.skin_section
+            organs = [(skin.labelmap, skin.label) != (name, label) for label in present.labels]
+            self.ends[name] = present.ends.only(np.array(organs))
             self.warnings.extend(present.notes(volume.path))
         return volume
 

@@ -6,9 +6,9 @@ cut it, and is widened to the sides by what the case states or by what is usual.
 What lies in the body beyond a label map: no organ there has a label, so it is not known to be free.
 
 TotalSegmentator and Slicer write maps that were cropped to a part of the CT, and lay them on a larger grid, with zeros
-around. So a map ends at its grid's faces, and at a plane in which several labels end flat with nothing beyond: organs
-end round. The part of the body beyond each such face becomes a closed surface of role ``unknown``; the air beyond it,
-outside of the skin, does not.
+around. So a map ends at its grid's faces, and at a plane in which several labels end flat with none of the map beyond:
+organs end round. Other maps on the grid may have been cropped there too, or not at all. The part of the body beyond
+each such face becomes a closed surface of role ``unknown``; the air beyond it, outside of the skin, does not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,13 +53,13 @@ VOXELS_OF_SLACK, CELL_MM = 1.0, 2.0
 by which the body beyond a map is found; it is widened by one cell to all sides."""
 FEWEST_FLAT, ORGAN_MM2 = 2, 2000.0
 """So many labels that end flat in one plane, with nothing beyond, were cut there, or one with so large an end: of the
-real abdomen's labels none ends by itself flat over more than 600 mm2, and no two in one plane."""
+real abdomen's labels none ends by itself flat over more than 800 mm2, and no two in one outermost plane."""
 ENDS = (
     "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
 )
 ENDS_FLAT = (
     "; its grid goes on, but its labels were cut off there, as it seems (flat ends in one plane: {flat}; if they end "
-    "so by themselves, a label of what lies beyond says so)"
+    "so by themselves, a label of what lies beyond, in the same map, says so)"
 )
 
 
@@ -225,8 +225,9 @@ def beyond_labels(
     Raises InputError: A map that does not hold the target, or one that ends in a body whose skin is open.
     """
     meshes, margins, warnings = list[TriangleMesh](), [0.0], []
-    for grid in label_grids(case):
-        voxels, (faces, flat) = grid.voxels, _shown(case, grid, ends)
+    grids = label_grids(case)
+    for grid in grids:
+        voxels, (faces, flat) = grid.voxels, _shown(case, grid, grids, ends)
         target = apply(np.linalg.inv(voxels.T_ct_index), case.target_ct[None])[0]
         if np.any((target < faces[0]) | (target > faces[1])):
             what = f"label map {grid.name} does not contain the target, so its surroundings are unknown"
@@ -258,32 +259,50 @@ def beyond_labels(
     return (solid,), tuple(warnings)
 
 
-def _shown(case: Case, grid: LabelGrid, ends: Mapping[str, LabelEnds]) -> tuple[Floats, Ints]:
-    """Low and high face, voxels, of what a map shows, and how many of its labels were cut off there; shapes (2, 3).
+def _shown(
+    case: Case, grid: LabelGrid, grids: Sequence[LabelGrid], ends: Mapping[str, LabelEnds]
+) -> tuple[Floats, Ints]:
+    """Low and high face, voxels, of what a map shows, and how many labels were cut off there; shapes (2, 3).
 
-    Where none was, it is the grid's face. A label beyond, in any map on the same grid, says that the others end there
-    by themselves; and the rods of a phantom do.
+    Where none was, it is the grid's face. A label beyond, in the same map, says that the others end there by
+    themselves; and the rods of a phantom do.
     """
-    faces, voxels = np.array([np.zeros(3), grid.voxels.shape]) - 0.5, grid.voxels
-    files = [name for name in ends if on_one_grid(case.volumes.source(name).grid, voxels)]
-    last = np.concatenate([ends[name].last for name in files])
-    if case.region == "phantom" or not len(last):
+    faces = np.array([np.zeros(3), grid.voxels.shape]) - 0.5
+    own, *others = (
+        LabelEnds(*map(np.concatenate, zip(*(ends[name] for name in one.files), strict=True)))
+        for one in (grid, *(other for other in grids if other is not grid))
+        if one is grid or on_one_grid(one.voxels, grid.voxels)
+    )
+    if case.region == "phantom" or not len(own.last):
         return faces, np.zeros((2, 3), int)
-    own = LabelEnds(*map(np.concatenate, zip(*(ends[name] for name in grid.files), strict=True)))
-    planes, flat = cut_off(own, last)
+    planes, flat = cut_off(own, [one for one in others if len(one.last)])
     return np.where(flat, planes, faces), flat
 
 
-def cut_off(own: LabelEnds, last: Ints) -> tuple[Floats, Ints]:
-    """The planes behind which no label lies, voxels, and how many of a map's labels were cut off there; shapes (2, 3).
+def cut_off(own: LabelEnds, others: Sequence[LabelEnds] = ()) -> tuple[Floats, Ints]:
+    """The planes behind which no label of a map lies, voxels, and how many labels were cut off there; shapes (2, 3).
 
-    ``last`` are the ends of all labels on its grid, (n, 3, 2).
+    ``others`` are the other maps on its grid, none empty. One whose labels end in the same plane was cut with it: of
+    several maps with a label each no one shows a cut by itself. Then more labels must end flat in the plane than maps
+    go on beyond it: of many organs two may well end in one slice.
     """
-    outermost = np.stack([last.min(axis=0)[:, 0], last.max(axis=0)[:, 1]])
-    flat_mm2 = np.where(own.last == outermost.T, own.flat_mm2, 0.0)
-    flat = np.count_nonzero(flat_mm2, axis=0).T
-    flat[(flat < FEWEST_FLAT) & (flat_mm2.max(axis=0, initial=0.0).T < ORGAN_MM2)] = 0
-    return outermost + [[-0.5], [0.5]], flat
+    plane, count, weight = _outermost(own)
+    pooled, pooled_weight, beyond = count.copy(), weight.copy(), np.zeros((2, 3), int)
+    for one in others:
+        ends, more, more_weight = _outermost(one)
+        pooled += np.where(ends == plane, more, 0)
+        pooled_weight += np.where(ends == plane, more_weight, 0)
+        beyond += (ends - plane) * [[-1], [1]] > 0
+    cut = (weight >= FEWEST_FLAT) | ((pooled_weight >= FEWEST_FLAT) & (pooled_weight > beyond))
+    return plane + [[-0.5], [0.5]], np.where(cut, pooled, 0)
+
+
+def _outermost(ends: LabelEnds) -> tuple[Ints, Ints, Ints]:
+    """A map's outermost slices; how many of its labels end flat there, and as how many they count: shapes (2, 3)."""
+    plane = np.stack([ends.last.min(axis=0)[:, 0], ends.last.max(axis=0)[:, 1]])
+    flat_mm2 = np.where(ends.last == plane.T, ends.flat_mm2, 0.0)
+    weight = np.where(flat_mm2 >= ORGAN_MM2, FEWEST_FLAT, flat_mm2 > 0.0).sum(axis=0).T
+    return plane, np.count_nonzero(flat_mm2, axis=0).T, weight
 
 
 def _near_body(case: Case, skin: TriangleMesh, voxels: VolumeGrid, margin_mm: float, memory: Memory) -> Floats:

@@ -10,8 +10,8 @@ from places import DATA, REAL_CT
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.anatomy.unseen import ORGAN_MM2, cut_off
-from puncture_twin.planning.formats.labels.labelmaps import LabelEnds, label_ends, labelmap_of
+from puncture_twin.planning.anatomy.unseen import cut_off
+from puncture_twin.planning.formats.labels.labelmaps import LabelEnds, LabelMap, label_ends, labelmap_of
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.search.context import prepare
@@ -172,6 +172,71 @@ def test_what_was_unsafe_is_never_safe_where_zeros_were_laid_over_a_part_of_the_
     assert (newly == "unknown_region").all()
 
 
+def lay_out(folder, labels, layout):
+    """The blanked organs as other files hold them: its own sections, and the skin's, in place of the case's."""
+
+    def write(name, voxels):
+        image = sitk.GetImageFromArray(voxels.astype(np.uint8))
+        image.SetSpacing([STEP_MM] * 3)
+        image.SetOrigin([-99.0] * 3)
+        sitk.WriteImage(image, str(folder / name))
+
+    listed = [n for n in range(1, len(ORGANS) + 1) if (labels == n).any()]
+    at = np.arange(100) * STEP_MM - 99.0
+    z, y, x = np.meshgrid(at, at, at, indexing="ij")
+    far = structure("far", "avoid", {"labelmap": "far.nrrd", "label": 1}, margin_mm=3.0)
+    write("far.nrrd", np.linalg.norm(np.stack([x - 72.0, y, z], axis=-1), axis=-1) < 8.0)
+    skin = SKIN
+    if layout == "skin of a label":
+        skin = structure("skin", "skin", {"labelmap": "body.nrrd", "label": 1})
+        write("body.nrrd", np.linalg.norm(np.stack([x, y, z], axis=-1), axis=-1) < 90.0)
+    one_file = layout == "a file each"
+    for n in listed:
+        write(f"o{n}.nrrd", labels == n)
+    files = {n: (f"o{n}.nrrd", 1) if one_file else ("labels.nrrd", n) for n in listed}
+    avoided = [structure(f"o{n}", "avoid", {"labelmap": f, "label": k}, margin_mm=3.0) for n, (f, k) in files.items()]
+    rest = [far] if layout != "skin of a label" else []
+    search = "theta_deg = [0, 180]\nstep_deg = 6.0"
+    (folder / "case.toml").write_text(case_text(skin, ORGAN, *avoided, *rest, search=search))
+
+
+@pytest.mark.parametrize("layout", ["a file each", "beside a whole map", "skin of a label"])
+def test_organs_that_were_blanked_are_known_however_their_files_are_laid_out(tmp_path, of_all_organs, layout):
+    """A label map with one organ shows no cut by itself; a bone's own map, or the body's, goes on beyond it."""
+    labels = organs()
+    labels[:, :, 74:] = 0
+    path = organ_case(tmp_path / "blanked", labels)
+    lay_out(path.parent, labels, layout)
+    context = prepare(path, arm=False)
+    assert any("flat ends in one plane: 2" in said for said in context.anatomy.warnings)
+    found = context.search()
+    assert not (found.safe & ~of_all_organs).any()
+    assert found.safe.any()
+
+
+def test_a_cut_that_takes_the_tips_of_large_organs_leaves_flat_ends():
+    """Small beside the organs' middles."""
+    at = np.arange(100) * STEP_MM - 99.0
+    z, y, x = np.meshgrid(at, at, at, indexing="ij")
+    voxels = np.zeros(z.shape, np.uint8)
+    for number, middle in enumerate(((20, 0, 50), (24, 40, -30)), start=1):
+        voxels[np.linalg.norm(np.stack([x, y, z], axis=-1) - middle, axis=-1) < 36.0] = number
+    whole = LabelMap(voxels.transpose(2, 1, 0), np.diag([STEP_MM, STEP_MM, STEP_MM, 1.0]), None, "tips")
+    assert not cut_off(label_ends(whole))[1].any(), "round organs end round"
+    kept = whole.labels.copy()
+    kept[75:] = 0  # of 78 and 80
+    planes, flat = cut_off(label_ends(replace(whole, labels=kept)))
+    assert (planes[1, 0], flat[1, 0], np.count_nonzero(flat)) == (74.5, 2, 1)
+
+
+def test_of_many_maps_with_a_label_each_two_may_end_flat_in_one_slice():
+    """Where more maps go on beyond it; the last three are one label each, in a plane of their own."""
+    pair = [LabelEnds(np.full((1, 3, 2), 40), np.full((1, 3, 2), 300.0))] * 2
+    other = LabelEnds(np.array([[[20, 60]] * 3]), np.zeros((1, 3, 2)))
+    assert cut_off(pair[0], [pair[1], other])[1].all()
+    assert not cut_off(pair[0], [pair[1], other, other])[1].any()
+
+
 def test_labels_that_end_flat_are_not_cut_where_another_label_lies_beyond_or_in_a_phantom(tmp_path, of_all_organs):
     labels = organs()
     labels[:, :, 74:] = 0
@@ -206,18 +271,14 @@ def test_where_real_labels_were_blanked_is_known_and_nowhere_else(file):
             kept = labels.labels.copy()
             kept.swapaxes(0, axis)[slice(at, None) if end else slice(at)] = 0
             ends = label_ends(replace(labels, labels=kept))
-            planes, flat = cut_off(ends, ends.last)
+            planes, flat = cut_off(ends)
             known, sides = known + (flat[end, axis] > 0 and planes[end, axis] == at - 0.5), sides + 1
     assert known >= 0.95 * sides > 0
     rng, called, sides = np.random.default_rng(1), 0, 0
     inside = np.array(labels.labels.shape) - 1.0
-    last, flat_mm2 = whole.last.transpose(0, 2, 1), whole.flat_mm2.transpose(0, 2, 1)
-    planes, flat = cut_off(whole, whole.last)
-    assert not flat[(planes > 0.0) & (planes < inside)].any()
-    assert flat_mm2[(last > 0) & (last < inside)].max() < 0.3 * ORGAN_MM2
     for _ in range(500):
         some = rng.choice(len(whole.last), rng.integers(2, len(whole.last) + 1), replace=False)
-        planes, flat = cut_off(LabelEnds(whole.last[some], whole.flat_mm2[some]), whole.last[some])
+        planes, flat = cut_off(LabelEnds(whole.last[some], whole.flat_mm2[some]))
         within = (planes > 0.0) & (planes < inside)
         called, sides = called + np.count_nonzero(flat[within]), sides + np.count_nonzero(within)
     assert called <= 0.01 * sides

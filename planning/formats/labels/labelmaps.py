@@ -46,8 +46,10 @@ ROUNDED_BY = 0.02
 """So far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
 LEAST_WHOLE = 0.15
 """Fraction of voxels besides the background: a blended map is whole inside its labels, an image in 4 % by chance."""
-FLAT, NEAR_MM, SPECK_MM2 = 0.5, 20.0, 100.0
-"""A label ends flat where its outermost slice is so much of its largest slice so near, and is no speck."""
+FLAT, NEAR_MM, SPECK_MM2 = 0.5, 6.0, 100.0
+"""A label ends flat where its outermost slice is so much of its largest slice so near, and is no speck. Near: a cut
+that takes but the tip of a round organ leaves an end that is small beside the organ's middle. Not nearer than a coarse
+map's steps are, where it was resampled to finer slices."""
 Box = tuple[slice, slice, slice]
 
 
@@ -56,6 +58,10 @@ class LabelEnds(NamedTuple):
 
     last: NDArray[np.int64]  # shape (n, 3, 2), its first and last slice
     flat_mm2: NDArray[np.float64]  # shape (n, 3, 2), the area of that slice where the label ends flat, else 0
+
+    def only(self, kept: Bools) -> "LabelEnds":
+        """Those of some labels, given by a mask (n,)."""
+        return LabelEnds(self.last[kept], self.flat_mm2[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +98,7 @@ def label_ends(labelmap: LabelMap) -> LabelEnds:
     flat_mm2 = np.zeros(last.shape)
     for (label, box), of_label in zip(boxes.items(), flat_mm2, strict=True):
         for axis, counts in enumerate(slice_counts(labelmap.labels[box] == label)):
-            near = 1 + round(NEAR_MM / spacing_mm[axis])
+            near = 1 + max(1, round(NEAR_MM / spacing_mm[axis]))
             areas_mm2 = counts * np.prod(np.delete(spacing_mm, axis))
             inward = areas_mm2[:near], areas_mm2[::-1][:near]
             of_label[axis] = [one[0] if one[0] >= max(SPECK_MM2, FLAT * one.max()) else 0.0 for one in inward]
