@@ -294,6 +294,7 @@ def cut_off(own: LabelEnds, others: Sequence[LabelEnds] = ()) -> tuple[Floats, I
         pooled_weight += np.where(ends == plane, more_weight, 0)
         beyond += (ends - plane) * [[-1], [1]] > 0
     cut = (weight >= FEWEST_FLAT) | ((pooled_weight >= FEWEST_FLAT) & (pooled_weight > beyond))
+    cut |= cut.any() & (weight > 0)
     return plane + [[-0.5], [0.5]], np.where(cut, pooled, 0)
 
 

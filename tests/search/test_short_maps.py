@@ -229,6 +229,15 @@ def test_a_cut_that_takes_the_tips_of_large_organs_leaves_flat_ends():
     assert (planes[1, 0], flat[1, 0], np.count_nonzero(flat)) == (74.5, 2, 1)
 
 
+def test_a_map_that_was_cut_at_one_face_is_cut_where_one_label_alone_ends_flat():
+    last = np.array([[[20, 60]] * 3, [[20, 55]] * 3, [[25, 60]] * 3])
+    flat_mm2 = np.zeros((3, 3, 2))
+    flat_mm2[0, 1, 1] = 300.0  # alone at the high end of axis 1
+    assert not cut_off(LabelEnds(last, flat_mm2))[1].any()
+    flat_mm2[:2, 2, 0] = 300.0  # two at the low end of axis 2
+    assert cut_off(LabelEnds(last, flat_mm2))[1].tolist() == [[0, 0, 2], [0, 1, 0]]
+
+
 def test_of_many_maps_with_a_label_each_two_may_end_flat_in_one_slice():
     """Where more maps go on beyond it; the last three are one label each, in a plane of their own."""
     pair = [LabelEnds(np.full((1, 3, 2), 40), np.full((1, 3, 2), 300.0))] * 2
