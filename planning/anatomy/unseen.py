@@ -275,13 +275,14 @@ def _shown(
     )
     if case.region == "phantom" or not len(own.last):
         return faces, np.zeros((2, 3), int)
-    planes, flat = cut_off(own, [one for one in others if len(one.last)])
+    planes, flat = cut_off(own, grid.voxels.shape, [one for one in others if len(one.last)])
     return np.where(flat, planes, faces), flat
 
 
-def cut_off(own: LabelEnds, others: Sequence[LabelEnds] = ()) -> tuple[Floats, Ints]:
+def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = ()) -> tuple[Floats, Ints]:
     """The planes behind which no label of a map lies, voxels, and how many labels were cut off there; shapes (2, 3).
 
+    None at the faces of the grid, of this shape, where the map ends anyhow.
     ``others`` are the other maps on its grid, none empty. One whose labels end in the same plane was cut with it: of
     several maps with a label each no one shows a cut by itself. Then more labels must end flat in the plane than maps
     go on beyond it: of many organs two may well end in one slice.
@@ -293,8 +294,9 @@ def cut_off(own: LabelEnds, others: Sequence[LabelEnds] = ()) -> tuple[Floats, I
         pooled += np.where(ends == plane, more, 0)
         pooled_weight += np.where(ends == plane, more_weight, 0)
         beyond += (ends - plane) * [[-1], [1]] > 0
-    cut = (weight >= FEWEST_FLAT) | ((pooled_weight >= FEWEST_FLAT) & (pooled_weight > beyond))
-    cut |= cut.any() & (weight > 0)
+    within = plane != np.array([np.zeros(3), shape]) - [[0], [1]]
+    cut = within & ((weight >= FEWEST_FLAT) | ((pooled_weight >= FEWEST_FLAT) & (pooled_weight > beyond)))
+    cut |= within & cut.any() & (weight > 0)
     return plane + [[-0.5], [0.5]], np.where(cut, pooled, 0)
 
 

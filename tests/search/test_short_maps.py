@@ -222,10 +222,10 @@ def test_a_cut_that_takes_the_tips_of_large_organs_leaves_flat_ends():
     for number, middle in enumerate(((20, 0, 50), (24, 40, -30)), start=1):
         voxels[np.linalg.norm(np.stack([x, y, z], axis=-1) - middle, axis=-1) < 36.0] = number
     whole = LabelMap(voxels.transpose(2, 1, 0), np.diag([STEP_MM, STEP_MM, STEP_MM, 1.0]), None, "tips")
-    assert not cut_off(label_ends(whole))[1].any(), "round organs end round"
+    assert not cut_off(label_ends(whole), voxels.shape)[1].any(), "round organs end round"
     kept = whole.labels.copy()
     kept[75:] = 0  # of 78 and 80
-    planes, flat = cut_off(label_ends(replace(whole, labels=kept)))
+    planes, flat = cut_off(label_ends(replace(whole, labels=kept)), voxels.shape)
     assert (planes[1, 0], flat[1, 0], np.count_nonzero(flat)) == (74.5, 2, 1)
 
 
@@ -233,17 +233,17 @@ def test_a_map_that_was_cut_at_one_face_is_cut_where_one_label_alone_ends_flat()
     last = np.array([[[20, 60]] * 3, [[20, 55]] * 3, [[25, 60]] * 3])
     flat_mm2 = np.zeros((3, 3, 2))
     flat_mm2[0, 1, 1] = 300.0  # alone at the high end of axis 1
-    assert not cut_off(LabelEnds(last, flat_mm2))[1].any()
+    assert not cut_off(LabelEnds(last, flat_mm2), (99, 99, 99))[1].any()
     flat_mm2[:2, 2, 0] = 300.0  # two at the low end of axis 2
-    assert cut_off(LabelEnds(last, flat_mm2))[1].tolist() == [[0, 0, 2], [0, 1, 0]]
+    assert cut_off(LabelEnds(last, flat_mm2), (99, 99, 99))[1].tolist() == [[0, 0, 2], [0, 1, 0]]
 
 
 def test_of_many_maps_with_a_label_each_two_may_end_flat_in_one_slice():
     """Where more maps go on beyond it; the last three are one label each, in a plane of their own."""
     pair = [LabelEnds(np.full((1, 3, 2), 40), np.full((1, 3, 2), 300.0))] * 2
     other = LabelEnds(np.array([[[20, 60]] * 3]), np.zeros((1, 3, 2)))
-    assert cut_off(pair[0], [pair[1], other])[1].all()
-    assert not cut_off(pair[0], [pair[1], other, other])[1].any()
+    assert cut_off(pair[0], (99, 99, 99), [pair[1], other])[1].all()
+    assert not cut_off(pair[0], (99, 99, 99), [pair[1], other, other])[1].any()
 
 
 def test_labels_that_end_flat_are_not_cut_where_another_label_lies_beyond_or_in_a_phantom(tmp_path, of_all_organs):
@@ -280,14 +280,14 @@ def test_where_real_labels_were_blanked_is_known_and_nowhere_else(file):
             kept = labels.labels.copy()
             kept.swapaxes(0, axis)[slice(at, None) if end else slice(at)] = 0
             ends = label_ends(replace(labels, labels=kept))
-            planes, flat = cut_off(ends)
+            planes, flat = cut_off(ends, kept.shape)
             known, sides = known + (flat[end, axis] > 0 and planes[end, axis] == at - 0.5), sides + 1
     assert known >= 0.95 * sides > 0
     rng, called, sides = np.random.default_rng(1), 0, 0
     inside = np.array(labels.labels.shape) - 1.0
     for _ in range(500):
         some = rng.choice(len(whole.last), rng.integers(2, len(whole.last) + 1), replace=False)
-        planes, flat = cut_off(LabelEnds(whole.last[some], whole.flat_mm2[some]))
+        planes, flat = cut_off(LabelEnds(whole.last[some], whole.flat_mm2[some]), labels.labels.shape)
         within = (planes > 0.0) & (planes < inside)
         called, sides = called + np.count_nonzero(flat[within]), sides + np.count_nonzero(within)
     assert called <= 0.01 * sides
