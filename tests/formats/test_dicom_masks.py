@@ -78,6 +78,20 @@ def test_segments_lie_where_they_were_drawn(scanned, tmp_path, omit):
     assert found.masks["Liver"].files == ("seg.dcm", *ct.files)
 
 
+@BOTH
+def test_frames_smaller_than_a_slice_say_nothing_of_what_lies_beside_them(scanned, tmp_path):
+    """Their masks' grid ends where they end: laid on the whole slice, organs that were never drawn were free."""
+    ct, T, _ = scanned
+    part = {name: mask[2:14, 1:12] for name, mask in masks().items()}
+    T_part = T.copy()
+    T_part[:3, 3] = (T @ [2, 1, 0, 1])[:3]
+    found = read_seg(world.segmentation(part, T_part), tmp_path, ct)
+    same(found, part, T_part)
+    for mask in found.masks.values():
+        assert mask.grid.shape == (12, 11, SHAPE[2])
+        assert np.allclose(mask.grid.T_ct_index, T_part)
+
+
 def test_segments_of_highdicom_come_back(scanned, tmp_path):
     ct, T, slices = scanned
     for number, one in enumerate(slices):

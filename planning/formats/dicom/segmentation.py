@@ -39,10 +39,10 @@ class _Frames:
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """The grid on which the masks are made, and where the frames' own grid begins in it."""
+    """The grid on which the masks are made, and its slice in which the first frame lies."""
 
     grid: VolumeGrid
-    offset: tuple[int, int, int]
+    first: int
 
 
 def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | None) -> named_masks.NamedMasks:
@@ -178,7 +178,11 @@ def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
 
 
 def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
-    """The masks' grid: the CT's own slices where the frames lie on them, else a grid of their own."""
+    """The masks' grid: the CT's own slices where the frames lie on them, else a grid of their own.
+
+    Slices without a frame are empty. But frames that are smaller than a slice say nothing of what lies beside them: the
+    grid ends where they end.
+    """
     own = (frames.columns, frames.rows, int(frames.steps.max()) + 1)
     if ct is not None:
         T_ct_slices, shape = ct.stack.T_ct_index, (*ct.slice_shape, len(ct.stack.slices))
@@ -186,16 +190,16 @@ def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
         offset = np.round(between[:3, 3]).astype(int)
         reach = np.abs(between[:3, :3] - np.eye(3)) @ np.array(own) + np.abs(between[:3, 3] - offset)
         if reach.max() <= ON_GRID + PLACE_TOLERANCE and (offset >= 0).all() and (offset + own <= shape).all():
-            return _Placed(VolumeGrid(shape, T_ct_slices, {}), (int(offset[0]), int(offset[1]), int(offset[2])))
-    return _Placed(VolumeGrid(check_shape((*own[:2], max(own[2], 2)), where=path), frames.T_ct_index, {}), (0, 0, 0))
+            T_ct_slices[:3, 3] += T_ct_slices[:3, :2] @ offset[:2]
+            return _Placed(VolumeGrid((*own[:2], shape[2]), T_ct_slices, {}), int(offset[2]))
+    return _Placed(VolumeGrid(check_shape((*own[:2], max(own[2], 2)), where=path), frames.T_ct_index, {}), 0)
 
 
 def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> named_masks.Mask:
     made = np.zeros(placed.grid.shape, np.uint8, order="F")
-    i, j, k = placed.offset
     for frame in np.flatnonzero(frames.segments == segment).tolist():
         image = _image(data, frame, frames.rows, frames.columns, path)
-        made[i : i + frames.columns, j : j + frames.rows, k + int(frames.steps[frame])] = image.T
+        made[:, :, placed.first + int(frames.steps[frame])] = image.T
     return made
 
 
