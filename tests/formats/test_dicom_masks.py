@@ -92,6 +92,18 @@ def test_frames_smaller_than_a_slice_say_nothing_of_what_lies_beside_them(scanne
         assert np.allclose(mask.grid.T_ct_index, T_part)
 
 
+@BOTH
+def test_a_file_that_states_empty_frames_says_nothing_of_slices_beyond_them(scanned, tmp_path):
+    ct, T, _ = scanned
+    part = {name: mask[:, :, 1:7] & (np.arange(6) < 4) for name, mask in masks().items()}
+    T_part = T.copy()
+    T_part[:3, 3] = (T @ [0, 0, 1, 1])[:3]
+    for omit, slices in ((False, 6), (True, SHAPE[2])):
+        found = read_seg(world.segmentation(part, T_part, omit=omit), tmp_path, ct)
+        same(found, part, T_part)
+        assert {mask.grid.shape for mask in found.masks.values()} == {(*SHAPE[:2], slices)}
+
+
 def test_segments_of_highdicom_come_back(scanned, tmp_path):
     ct, T, slices = scanned
     for number, one in enumerate(slices):

@@ -69,7 +69,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
         names[segment] = dicom_file.text(item, "SegmentLabel", where=where)
     named_masks.unique_names(list(names.values()), path)
     frames = _frames(data, names, ct, path)
-    placed = _placed(frames, ct, path)
+    placed = _placed(data, frames, ct, path)
     files = (file,) if ct is None else (file, *ct.files)
     masks = {}
     for segment, called in names.items():
@@ -177,11 +177,11 @@ def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
     return least
 
 
-def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
+def _placed(data: Dataset, frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
     """The masks' grid: the CT's own slices where the frames lie on them, else a grid of their own.
 
-    Slices without a frame are empty. But frames that are smaller than a slice say nothing of what lies beside them: the
-    grid ends where they end.
+    Slices without a frame are empty. But frames that are smaller than a slice say nothing of what lies beside them, and
+    a file that states empty frames left none out, so nothing of slices beyond: the grid ends where they end.
     """
     own = (frames.columns, frames.rows, int(frames.steps.max()) + 1)
     if ct is not None:
@@ -190,9 +190,17 @@ def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
         offset = np.round(between[:3, 3]).astype(int)
         reach = np.abs(between[:3, :3] - np.eye(3)) @ np.array(own) + np.abs(between[:3, 3] - offset)
         if reach.max() <= ON_GRID + PLACE_TOLERANCE and (offset >= 0).all() and (offset + own <= shape).all():
-            T_ct_slices[:3, 3] += T_ct_slices[:3, :2] @ offset[:2]
-            return _Placed(VolumeGrid((*own[:2], shape[2]), T_ct_slices, {}), int(offset[2]))
+            whole = own[2] < 2 or not _states_empty_frames(data, frames, path)
+            count, first = (shape[2], int(offset[2])) if whole else (own[2], 0)
+            T_ct_slices[:3, 3] += T_ct_slices[:3] @ [*offset[:2], offset[2] - first, 0]
+            return _Placed(VolumeGrid((*own[:2], count), T_ct_slices, {}), first)
     return _Placed(VolumeGrid(check_shape((*own[:2], max(own[2], 2)), where=path), frames.T_ct_index, {}), 0)
+
+
+def _states_empty_frames(data: Dataset, frames: _Frames, path: Path) -> bool:
+    """Whether a frame in the first or the last slice is empty."""
+    at_ends = np.flatnonzero((frames.steps == 0) | (frames.steps == frames.steps.max())).tolist()
+    return any(not _image(data, frame, frames.rows, frames.columns, path).any() for frame in at_ends)
 
 
 def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> named_masks.Mask:
