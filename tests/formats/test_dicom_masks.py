@@ -248,7 +248,7 @@ def test_slices_that_were_left_out_are_filled_and_small_contours_are_kept(tmp_pa
         world.structure_set(
             {
                 "organ": [outline(T, 1, box((2, 2), (6, 6))), outline(T, 4, box((4, 2), (8, 6)))],
-                "nodes": [outline(T, 1, box((2, 2), (3, 3))), outline(T, 4, box((9, 9), (10, 10)))],
+                "nodes": [outline(T, 1, box((2, 2), (3, 3))), outline(T, 4, box((17, 13), (18, 14)))],
                 "vessel": [small],
                 "wire": [outline(T, 1, [(7, 9)]), outline(T, 2, [(10, 4), (12, 4)])],  # as planning systems leave them
                 "couch": [outline(T, 2, box((-9, 12), (40, 13)))],
@@ -261,13 +261,13 @@ def test_slices_that_were_left_out_are_filled_and_small_contours_are_kept(tmp_pa
     )
     truth = {name: np.zeros(SHAPE, bool) for name in found.masks}
     truth["organ"][2:7, 2:7, 1] = truth["organ"][4:9, 2:7, 4] = truth["organ"][2:9, 2:7, 2:4] = True
-    truth["nodes"][2:4, 2:4, 1] = truth["nodes"][9:11, 9:11, 4] = True
     truth["wire"][7, 9, 1] = truth["wire"][10:13, 4, 2] = True
+    truth["nodes"][2:4, 2:4, 1] = truth["nodes"][17:19, 13:15, 4] = True
     truth["vessel"][14, 3, 1] = truth["couch"][:, 12:14, 2][...] = True
     same(found, truth, T)
     notes = " | ".join(found.notes)
     assert "not closed (points, lines) were left out of isocentre" in notes
-    assert "filled where both overlap or all are evenly spaced, and otherwise left empty, in organ, nodes" in notes
+    assert "filled where both overlap, lie near each other or all are evenly spaced, and otherwise left empty" in notes
     assert "smaller than a pixel count as the pixels along them, in vessel, wire" in notes
     assert "beyond the CT's image end there, in couch" in notes
 
@@ -321,6 +321,30 @@ def test_a_leaning_vessel_drawn_in_every_third_slice_has_no_gaps(scanned, tmp_pa
     values = found.masks["vessel"].volume().values
     for k in range(7):
         assert values[2 + 2 * k : 5 + 2 * k, 5:8, k].all(), k
+
+
+@pytest.mark.parametrize("drawn", [(0, 2, 6), (0, 1, 2, 4, 6), (0, 3, 5)])
+def test_a_leaning_vessel_drawn_in_some_slices_has_no_gaps(scanned, tmp_path, drawn):
+    """Its steps are uneven: nothing was filled between them, or what overlaps, with an upright one beside it."""
+    ct, T, _ = scanned
+    leaning = [outline(T, k, box((2 + 2 * k, 5), (3 + 2 * k, 7))) for k in drawn]
+    upright = [outline(T, k, box((1, 11), (3, 13))) for k in drawn]
+    found = read_rt(world.structure_set({"vessel": leaning, "both": leaning + upright}), tmp_path, ct)
+    for name, mask in found.masks.items():
+        values = mask.volume().values
+        for k in range(drawn[-1]):
+            assert values[2 + 2 * k : 4 + 2 * k, 5:8, k].all(), (name, k)
+            assert values[1:4, 11:14, k].all() == (name == "both")
+
+
+def test_a_leaning_vessel_whose_contours_overlap_a_little_is_not_pinched(scanned, tmp_path):
+    ct, T, _ = scanned
+    contours = [
+        outline(T, k, diamond)
+        for k, diamond in ((1, [(5, 2), (10, 7), (5, 12), (0, 7)]), (3, [(13, 2), (18, 7), (13, 12), (8, 7)]))
+    ]
+    values = read_rt(world.structure_set({"vessel": contours}), tmp_path, ct).masks["vessel"].volume().values
+    assert values[6:13, 3:12, 2].all(), "as wide between the two as either is"
 
 
 @pytest.mark.parametrize("with_ct", [True, False])

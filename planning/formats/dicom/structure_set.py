@@ -4,9 +4,11 @@ import itertools
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 from pydicom.dataelem import RawDataElement
 from pydicom.dataset import Dataset
 from skimage.morphology import convex_hull_image
@@ -27,9 +29,14 @@ ON_SLICE = 0.1
 """Fraction of the step by which a contour may miss its slice."""
 MAX_CONTOUR_POINTS = 100_000
 """In one contour: an image of 1000 pixels has 4000 around it."""
+LEAN = 1.5
+"""Parts in the two slices about a gap are one where they lie no farther apart sideways than so often its height: what
+leans by 60 degrees and is thin."""
+OVERLAP = 0.5
+"""Parts that overlap by less of the smaller one lean: both together would be pinched in the middle between them."""
 GAPS = (
-    "slices without a contour, between two with one, were filled where both overlap or all are evenly spaced, and "
-    "otherwise left empty, in"
+    "slices without a contour, between two with one, were filled where both overlap, lie near each other or all are "
+    "evenly spaced, and otherwise left empty, in"
 )
 MAX_LENGTH = 5_000_000
 """Pixels along one contour; the finest line through every pixel of an image has fewer."""
@@ -54,8 +61,9 @@ class _Region:
 def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -> named_masks.NamedMasks:
     """The regions of an RTSTRUCT, each by its name, on the slices of a CT; ``file`` is its key in ``content``.
 
-    A slice between two contoured ones is filled with what either of them encloses, where they overlap: programs leave
-    slices out and interpolate, and a gap in an organ would count as free. What encloses no pixel's centre counts for
+    A slice between two contoured ones is filled with what either of them encloses, where they overlap, and with the
+    hull of parts that lie near each other: programs leave slices out and interpolate, and a gap in an organ would count
+    as free. What encloses no pixel's centre counts for
     the pixels along it. Both are noted.
 
     Raises:
@@ -71,7 +79,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     regions = _regions(data, names, grid, path)
     files = (file, *ct.files)
     masks = {
-        called: named_masks.MaskVolume(path, files, (called,), grid, partial(_mask, regions[roi].contours, grid.shape))
+        called: named_masks.MaskVolume(path, files, (called,), grid, partial(_mask, regions[roi].contours, grid))
         for roi, called in names.items()
     }
     notes = _notes({names[roi]: region for roi, region in regions.items()}, grid, where)
@@ -137,28 +145,55 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
     return Contour(int(slices[0]), index[:, :2])
 
 
-def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> named_masks.Mask:
-    made = np.zeros(shape, np.uint8, order="F")
+def _mask(contours: tuple[Contour, ...], grid: VolumeGrid) -> named_masks.Mask:
+    made = np.zeros(grid.shape, np.uint8, order="F")
     for number in {one.slice for one in contours}:
-        made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], shape[:2])
+        made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], grid.shape[:2])
+    # Whether at least three slices have contours, all at one distance of several slices
+    steps = {above - below for below, above in itertools.pairwise(_slices(contours))}
+    even = len(_slices(contours)) > 2 and len(steps) == 1 and steps != {1}
     for below, above in _gaps(contours):
-        made[:, :, below + 1 : above] = _between(made[:, :, below] > 0, made[:, :, above] > 0, contours)[:, :, None]
+        near = LEAN * (above - below) * grid.spacing_mm[2] / grid.spacing_mm[:2]
+        between = _between(made[:, :, below] > 0, made[:, :, above] > 0, near, even=even)
+        made[:, :, below + 1 : above] = between[:, :, None]
     return made
 
 
-def _between(below: Bools, above: Bools, contours: tuple[Contour, ...]) -> Bools:
-    """Masks of left-out slices: where the contours of both neighbours overlap.
+def _between(below: Bools, above: Bools, near: Floats, *, even: bool) -> Bools:
+    """Masks of left-out slices: what either neighbour encloses where they overlap, and between parts of both.
 
-    What is drawn in every so-many slices goes on between them too where it leans too much to overlap: within the
-    convex hull of both.
+    What leans too much to overlap goes on between them: within the convex hull of two parts that are so near, pixels
+    (2,), or of all where it is drawn in every so-many slices (``even``).
     """
-    if (below & above).any():
-        return below | above
-    # Whether at least three slices have contours, all at one distance of several slices
-    steps = {above - below for below, above in itertools.pairwise(_slices(contours))}
-    if len(_slices(contours)) > 2 and len(steps) == 1 and steps != {1}:
+    overlap = bool((below & above).any())
+    if even and not overlap:
         return np.asarray(convex_hull_image(below | above))
-    return np.zeros_like(below)
+    made = below | above if overlap else np.zeros_like(below)
+    lower, upper = _parts(below), _parts(above)
+    for number, (low, high) in enumerate(zip(lower.low, lower.high, strict=True), start=1):
+        apart = np.maximum(np.maximum(upper.low - high, low - upper.high), 0)
+        for k in np.flatnonzero(np.linalg.norm(apart / near, axis=1) <= 1.0).tolist():
+            first, last = np.minimum(low, upper.low[k]), np.maximum(high, upper.high[k])
+            box = slice(first[0], last[0] + 1), slice(first[1], last[1] + 1)
+            one, other = lower.numbers[box] == number, upper.numbers[box] == k + 1
+            if np.count_nonzero(one & other) < OVERLAP * min(np.count_nonzero(one), np.count_nonzero(other)):
+                made[box] |= convex_hull_image(one | other)
+    return made
+
+
+class _Parts(NamedTuple):
+    """The n connected parts of a slice."""
+
+    numbers: NDArray[np.int32]  # of each pixel's part, from 1; 0 outside
+    low: NDArray[np.int64]  # shape (n, 2), the first pixel of each
+    high: NDArray[np.int64]  # shape (n, 2), its last
+
+
+def _parts(pixels: Bools) -> _Parts:
+    numbers, _ = scipy.ndimage.label(pixels, np.ones((3, 3)))
+    ends = np.array([[[at.start, at.stop - 1] for at in box] for box in scipy.ndimage.find_objects(numbers)], np.int64)
+    low, high = np.moveaxis(ends.reshape(-1, 2, 2), 2, 0)
+    return _Parts(numbers, low, high)
 
 
 def _slice_mask(contours: list[Contour], shape: tuple[int, int]) -> Bools:
