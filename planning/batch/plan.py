@@ -1,6 +1,6 @@
 """The plan of a cohort (``plan.parquet``) and the results of its cases on disk.
 
-A case's id is the hash of its inputs, its options and the version. Its result is a folder ``DIR/ID`` that appears by
+A case's id is the hash of its inputs, its options and the program. Its result is a folder ``DIR/ID`` that appears by
 one rename, with everything in it or not at all.
 """
 
@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.base.errors import InputError, PlanningError, one_line, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output import manifest
@@ -35,6 +37,8 @@ from puncture_twin.planning.case.options import case_options
 
 PLAN_NAME, MAX_PLAN_BYTES, ID_DIGITS = "plan.parquet", 2_000_000_000, 32
 """Hexadecimal digits of an id: 128 bits, and too many digits for a number in any reader of partitions."""
+DECIDES, STAMP_DIGITS = "puncture_twin.planning.batch.run_case", 12
+"""The module that makes a case's row, with all that it imports; and digits of the hash of their code."""
 OWN_FOLDER = "the case's folder"
 NO_PLAN = "a folder written by `batch plan COHORT --out DIR`"
 
@@ -44,7 +48,7 @@ class PlannedCase:
     """A row of the plan."""
 
     case: str
-    id: str  # hash of inputs, options and version; also the name of its result's folder
+    id: str  # hash of inputs, options and program; also the name of its result's folder
     name: str
     path: str
     options: str
@@ -58,17 +62,23 @@ SCHEMA = pa.schema([(one.name, pa.bool_() if one.name == "arm" else pa.string())
 
 @dataclass(frozen=True)
 class Plan:
-    """A cohort's plan, and the version of this package that made it."""
+    """A cohort's plan, and the `program` that made it."""
 
     cases: tuple[PlannedCase, ...]
     sha256: str
     version: str
 
 
+@cache
+def program() -> str:
+    """The version, and a hash of the code that gives a verdict: between two releases one version has many programs."""
+    return f"{version('puncture-twin')}+{source_stamp(DECIDES)[:STAMP_DIGITS]}"
+
+
 def case_id(options: str, arm: bool | None, inputs: Sequence[Input], refusal: str) -> str:
-    """The id of a case: the same bytes, options and version give the same id, wherever the files lie."""
+    """The id of a case: the same bytes, options and program give the same id, wherever the files lie."""
     stated = [(one.role, "" if one.role == CASE_ROLE else one.path, one.sha256) for one in inputs]
-    decides = {"version": version("puncture-twin"), "options": options, "arm": arm, "refusal": refusal}
+    decides = {"version": program(), "options": options, "arm": arm, "refusal": refusal}
     text = json.dumps({**decides, "inputs": sorted(stated)}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:ID_DIGITS]
 
@@ -105,7 +115,7 @@ def relative_text(text: str, row: PlannedCase) -> str:
 
 def write_plan_table(rows: Sequence[PlannedCase], path: Path) -> None:
     """Write the plan, whole or not at all."""
-    schema = SCHEMA.with_metadata({"version": version("puncture-twin")})
+    schema = SCHEMA.with_metadata({"version": program()})
     table = pa.Table.from_pylist([asdict(row) for row in rows], schema)
     with atomic(path) as temporary, temporary.open("wb") as stream:
         pq.write_table(table, stream)

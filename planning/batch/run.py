@@ -19,7 +19,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -139,8 +138,8 @@ def run_cohort(
         InputError: No plan, one of another version, another run in the folder, or a disk that takes no more.
     """
     plan = plans.read_plan_table(out)
-    if plan.version != version("puncture-twin"):
-        what = f"the plan is of version {plan.version}, this program is {version('puncture-twin')}"
+    if plan.version != plans.program():
+        what = f"the plan is of version {plan.version}, this program is {plans.program()}"
         refuse(what, out, "repeat batch plan: unchanged results are kept", "unknown_version")
     with running(out, part) as work:
         rows = part.of(plan.cases)
@@ -166,7 +165,7 @@ def run_cohort(
 
 
 def distinct(cases: Iterable[plans.PlannedCase]) -> list[plans.PlannedCase]:
-    """The first case of each id: the same bytes, options and version have one answer."""
+    """The first case of each id: the same bytes, options and program have one answer."""
     return list({one.id: one for one in reversed(list(cases))}.values())[::-1]
 
 

@@ -1,9 +1,10 @@
-"""An id is the hash of inputs, options and version alone; each case is in one part, and SLURM's array says which."""
+"""An id is the hash of inputs, options and program alone; each case is in one part, and SLURM's array says which."""
 
 import re
 import shlex
 import shutil
 import subprocess
+from importlib.metadata import version
 from itertools import product
 
 import pytest
@@ -12,9 +13,10 @@ from cohort_world import plan_of, write_patient
 from places import ROOT
 from refusals import refused
 
+from puncture_twin.planning.base.cache.source_stamp import closure
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.batch import plan as plans
-from puncture_twin.planning.batch.plan import identified, read_plan_table, write_plan_table
+from puncture_twin.planning.batch.plan import identified, program, read_plan_table, write_plan_table
 from puncture_twin.planning.batch.run import Part, parse_part, slurm_part
 from puncture_twin.run_twin import app
 
@@ -45,8 +47,23 @@ def test_every_byte_and_option_decides(tmp_path, monkeypatch):
     rib.write_bytes(content[1])
     organ.write_bytes(content[0])
     ids.append(id_of(path))
-    monkeypatch.setattr(plans, "version", lambda _: "9.9")
+    monkeypatch.setattr(plans, "program", lambda: "9.9")
     assert len({*ids, id_of(path)}) == 8
+
+
+def test_code_that_was_edited_between_two_releases_is_another_program(monkeypatch):
+    """A row of the code before it stood for "safe" where the code after it says no."""
+    before = program()
+    assert before.startswith(f"{version('puncture-twin')}+")
+    program.cache_clear()
+    monkeypatch.setattr(plans, "source_stamp", lambda module: f"edited {module}")
+    try:
+        assert program() != before
+    finally:
+        program.cache_clear()
+    decides = closure([str(ROOT / "planning" / "batch" / "run_case.py")])
+    for one in ("anatomy/unseen", "clearance/fast_engine", "formats/dicom/structure_set", "search/constraints"):
+        assert str(ROOT / "planning" / f"{one}.py") in decides
 
 
 def test_a_case_that_cannot_be_read_is_planned_with_its_reason(tmp_path):
