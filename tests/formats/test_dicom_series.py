@@ -173,6 +173,22 @@ def test_a_series_that_is_no_regular_stack_is_refused_naming_the_slice(tmp_path,
         read_series(folder)
 
 
+@pytest.mark.parametrize("numbers", ["1212", "1231231"])
+def test_two_scans_whose_slices_lie_in_turns_are_refused(tmp_path, numbers):
+    """In one series: together they looked like one of half the step. Parts of one scan lie one behind the other."""
+
+    def written(name, numbers):
+        slices = world.series(world.phantom((7, 5, len(numbers))))
+        for one, number in zip(slices, numbers, strict=True):
+            one.AcquisitionNumber = number
+        return world.write_series(tmp_path / name, slices)
+
+    with refused("several_acquisitions", "in turns"):
+        read_series(written("turns", numbers))
+    for name, parts in (("parts", sorted(numbers)), ("own", range(len(numbers))), ("slip", "1121111"[: len(numbers)])):
+        assert read_series(written(name, parts)).values.shape == (7, 5, len(numbers))
+
+
 def scout():
     data = world.ct_slice(world.phantom()[:, :, 0], world.affine(TURNS["coronal"]), series=world.ROOT + "50", number=77)
     data.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]

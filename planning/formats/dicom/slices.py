@@ -6,8 +6,10 @@ Names, instance numbers and slice locations are not used: they are often wrong, 
 them.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +58,7 @@ class Slice:
     plane: Plane
     slope: float  # what a stored value is multiplied with
     intercept: float  # what is added then; the sum is in Hounsfield units
+    acquisition: str  # the number of the scan of which it is; empty where it is not stated
 
 
 def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
@@ -145,7 +148,10 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
     if slope == 0 or abs(slope) > 1e6 or abs(intercept) > 1e6:
         what = f"rescaling by {slope:g} and {intercept:g}"
         refuse(what, label, "a slope other than 0, both within a million", "out_of_range")
-    return Slice(file, frame, label, plane_of(groups, label), slope, intercept)
+    stated = [(groups.own, "AcquisitionNumber")] if groups.own is groups.shared else []
+    stated += [(one, "FrameAcquisitionNumber") for one in groups.find("FrameContentSequence", label)]
+    acquisition = next((text(one, keyword, where=label) for one, keyword in stated), "")
+    return Slice(file, frame, label, plane_of(groups, label), slope, intercept, acquisition)
 
 
 AXES_TOLERANCE = 1e-3
@@ -184,7 +190,7 @@ def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
     """The stack that slices make.
 
     Raises InputError: fewer than two, other orientations or pixel sizes, several at one place, a step that is missing,
-    or uneven steps; the slices are named.
+    uneven steps, or two scans whose slices lie in turns; the slices are named.
     """
     if len(slices) < 2:
         refuse(f"{len(slices)} slice", where, "a series of at least 2 slices", "too_few_slices")
@@ -214,6 +220,7 @@ def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
         more = f", and at {len(wrong) - 1} more places" if len(wrong) > 1 else ""
         allowed = f"even steps; here mostly {step:.4g} mm (resample the series, or export it again)"
         refuse(f"{what}{more}", where, allowed, "uneven_slices")
+    _check_one_scan(ordered, where)
     step_ct = (origins[-1] - origins[0]) / (len(ordered) - 1)
     off = np.linalg.norm(origins - origins[0] - np.arange(len(ordered))[:, None] * step_ct, axis=1)
     worst = int(np.argmax(off))
@@ -233,6 +240,20 @@ def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> No
     more = f" and {len(named) - SHOWN} more pairs" if len(named) > SHOWN else ""
     allowed = "one slice at each position (one time point, no copies)"
     refuse(f"several slices at one position: {'; '.join(named[:SHOWN])}{more}", where, allowed, "duplicate_place")
+
+
+def _check_one_scan(ordered: Sequence[Slice], where: Path) -> None:
+    """Refuse two scans that lie in turns: the patient breathed between them, and neither shows what is between its own.
+
+    One that is scanned in parts has them one behind the other; a number that stands in one place alone is a slip.
+    """
+    starts = [one for before, one in pairwise(ordered) if one.acquisition != before.acquisition]
+    runs = Counter(one.acquisition for one in (ordered[0], *starts))
+    again = [number for number, count in runs.items() if number and count > 1]
+    if len(again) > 1:
+        first, second = (next(one.label for one in ordered if one.acquisition == number) for number in again[:2])
+        what = f"slices of {len(again)} acquisitions lie in turns, such as {first} and {second}"
+        refuse(what, where, "one acquisition: move the other's files elsewhere", "several_acquisitions")
 
 
 def _tolerance(step: float) -> float:
