@@ -285,7 +285,8 @@ def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = 
     None at the faces of the grid, of this shape, where the map ends anyhow.
     ``others`` are the other maps on its grid, none empty. One whose labels end in the same plane was cut with it: of
     several maps with a label each no one shows a cut by itself. Then more labels must end flat in the plane than maps
-    go on beyond it: of many organs two may well end in one slice.
+    go on beyond it: of many organs two may well end in one slice. What was cropped has as a rule several faces: at the
+    others of a map of which two labels were cut at one, one flat end is enough.
     """
     plane, count, weight = _outermost(own)
     pooled, pooled_weight, beyond = count.copy(), weight.copy(), np.zeros((2, 3), int)
@@ -296,7 +297,7 @@ def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = 
         beyond += (ends - plane) * [[-1], [1]] > 0
     within = plane != np.array([np.zeros(3), shape]) - [[0], [1]]
     cut = within & ((weight >= FEWEST_FLAT) | ((pooled_weight >= FEWEST_FLAT) & (pooled_weight > beyond)))
-    cut |= within & cut.any() & (weight > 0)
+    cut |= within & (cut & (pooled >= FEWEST_FLAT)).any() & (weight > 0)
     return plane + [[-0.5], [0.5]], np.where(cut, pooled, 0)
 
 
