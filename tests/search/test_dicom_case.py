@@ -24,7 +24,7 @@ from tools.phantoms.ct_image import rendered
 SPINE = structure("spine", "avoid", {"labelmap": "labels.nii.gz", "label": 2}, margin_mm=2.0)
 LESION = structure("lesion", "target", {"labelmap": "labels.nii.gz", "label": 1})
 HEAD = """schema = 2
-region = "other"
+region = "phantom"
 name = "supine"
 space = "LPS"
 [target]
