@@ -59,7 +59,7 @@ ENDS = (
 )
 ENDS_FLAT = (
     "; its grid goes on, but its labels were cut off there, as it seems (flat ends in one plane: {flat}; if they end "
-    "so by themselves, a label of what lies beyond, in the same map, says so)"
+    'so by themselves, a label of what lies beyond, in the same map, says so, or of a phantom region = "phantom")'
 )
 
 
@@ -290,8 +290,12 @@ def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = 
     """
     plane, count, weight = _outermost(own)
     pooled, pooled_weight, beyond = count.copy(), weight.copy(), np.zeros((2, 3), int)
-    for one in others:
-        ends, more, more_weight = _outermost(one)
+    for other in others:
+        alike = (other.last[:, None] == own.last) & (other.flat_mm2[:, None] == own.flat_mm2)
+        twice = alike.all(axis=(2, 3)).any(axis=1)  # an organ that is in both maps is one
+        if twice.all():
+            continue
+        ends, more, more_weight = _outermost(other.only(~twice))
         pooled += np.where(ends == plane, more, 0)
         pooled_weight += np.where(ends == plane, more_weight, 0)
         beyond += (ends - plane) * [[-1], [1]] > 0

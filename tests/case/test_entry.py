@@ -6,6 +6,7 @@ from hypothesis import given, strategies as st
 from refusals import refused
 
 import puncture_twin.planning.case.entry
+from puncture_twin.planning.case.case import view_frame
 from puncture_twin.planning.case.entry import angles, direction, entry_frame, grid, needle_pose, outward
 from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.spaces import Space
@@ -86,6 +87,14 @@ def test_the_bodys_directions_are_those_of_lps():
     expected = {"left": (1, 0, 0), "posterior": (0, 1, 0), "head": (0, 0, 1)}
     expected |= {"right": (-1, 0, 0), "anterior": (0, -1, 0), "feet": (0, 0, -1)}
     assert dict(puncture_twin.planning.case.entry.ANATOMICAL_LPS) == expected
+
+
+def test_the_view_frame_stands_on_the_target():
+    """T_ct_entry maps the entry frame's origin to the target and its axes to the columns; nobody can write to it."""
+    R, target = entry_frame("bed", Space.LPS), np.array([10.0, -20.0, 30.0])
+    T = view_frame(R, target)
+    np.testing.assert_array_equal(T, [[0, -1, 0, 10], [0, 0, -1, -20], [1, 0, 0, 30], [0, 0, 0, 1]])
+    assert not T.flags.writeable
 
 
 def test_angles_of_many_directions():

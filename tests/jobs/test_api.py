@@ -76,11 +76,20 @@ def test_register_takes_two_lists_and_no_case():
         pt.register(ct, {"a": (0, 0, 0), "b": (100, 0, 0), "x": (0, 80, 0)}, target_ct=(0, 0, 0))
 
 
-def test_a_mesh_states_its_unit():
+def test_files_are_read_and_written_under_the_one_name(tmp_path):
+    """Points go to a CSV and come back the same; a mesh states its unit; an unknown unit is one line."""
+    points = {"A": (1.5, -2.0, 3.25), "B": (0.0, 10.0, -7.0)}
+    pt.write_points(points, tmp_path / "points.csv")
+    read = pt.read_points(tmp_path / "points.csv")
+    assert read.names == ("A", "B")
+    assert read.points.tolist() == [list(point) for point in points.values()]
     liver = folder() / "abdomen" / "liver.ply"
     assert np.array_equal(pt.read_mesh(liver, unit="cm").vertices, 10.0 * pt.read_mesh(liver).vertices)
     with refused("unknown_choice", "inch"):
         pt.read_mesh(liver, unit="inch")
+    with refused("no_such_file"):
+        pt.read_mesh(tmp_path / "none.stl")
+    assert pt.check_folder(tmp_path) == ("manifest.json is missing",)
 
 
 def same_candidates(one, other):

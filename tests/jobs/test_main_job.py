@@ -1,5 +1,6 @@
 """The command line end to end on the carton: every file, every exit code."""
 
+import io
 import json
 import re
 import shutil
@@ -19,6 +20,7 @@ from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK, PROGRAM_FAILED
 from puncture_twin.twin.jobs.options import prepared
 from puncture_twin.twin.jobs.patient import main_job
+from puncture_twin.twin.report.progress import LineDisplay, progress_display
 
 pytestmark = pytest.mark.usefixtures("short_film")
 
@@ -49,6 +51,13 @@ def test_a_demo_without_the_simulator_plans(carton, tmp_path, monkeypatch, capfd
     with prepared(carton) as context:
         assert main_job.demo_case(context, tmp_path) == (context, tmp_path)
     assert "warning: planned, not rehearsed: demo: it needs the extra 'twin'" in capfd.readouterr().err
+
+
+def test_a_rehearsal_writes_every_file(rehearsed):
+    names = "candidates.parquet map.png scene.png slices.png plan.json rehearsal.json rehearsal.mp4 report.html"
+    names = {*names.split(), "manifest.json", "timings.json"}
+    assert {path.name for path in rehearsed.iterdir()} == names
+    assert all(path.stat().st_size > 0 for path in rehearsed.iterdir())
 
 
 def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, run):
@@ -139,7 +148,7 @@ def test_of_many_rooms_the_median_is_shown(carton, rehearsed, run, tmp_path):
     assert int(place) == round(one["percentile"])
     assert 'href="rehearsal.gif"' in page and "rehearsal.mp4" not in page
     assert 'href="rehearsal.mp4"' in (rehearsed / "report.html").read_text()
-    assert {"rehearsal.gif", "rooms.png", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"rehearsal.gif", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
     assert problems(tmp_path / "out") == ()
     assert main(["rehearse", str(carton), "--physics", "1", "--out", str(tmp_path / "no")]) == BAD_INPUT
 
@@ -154,21 +163,36 @@ def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path
     assert not out.exists()
 
 
-def test_the_counts_of_a_search_are_those_of_its_table(carton, run, tmp_path):
-    code, found = run("search", carton, "--no-arm", "--no-pictures", "--out", tmp_path)
+def test_a_new_search_leaves_nothing_of_an_old_one(carton, run, tmp_path, capfd):
+    """Counts are the table's; pictures and page of an earlier search go with it; notes kept there by somebody stay."""
+    code, found = run("search", carton, "--no-arm", "--out", tmp_path)
     verdicts = pq.read_table(tmp_path / "candidates.parquet")["verdict"].to_pylist()
     assert code == OK and (found["directions"], found["plan"]) == (len(verdicts), None)
-    assert found["counts"]["safe"] == verdicts.count("safe") and problems(tmp_path) == ()
+    assert found["counts"]["safe"] == verdicts.count("safe") and (tmp_path / "report.html").is_file()
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
+    went = "map.png, report.html, scene.png, slices.png of an earlier run removed: not part of this search"
+    assert f"{tmp_path}: {went}" in capfd.readouterr().err
+    names = {"candidates.parquet", "manifest.json", "timings.json", "notes.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == names and problems(tmp_path) == ()
 
 
 def test_a_plan_of_a_set_is_read_only_as_it_was_written(rehearsed, tmp_path, capfd):
-    """Edited beside its manifest: refused, one line."""
+    """Edited beside its manifest: refused, one line. Outside of any set: read, with one line of warning."""
     copy = tmp_path / "copy"
     shutil.copytree(rehearsed, copy)
     plan = copy / "plan.json"
+    assert main(["export", str(plan), "--format", "csv", "--out", str(copy)]) == OK
+    assert capfd.readouterr().err == "" and problems(copy) == ()
     plan.write_text(plan.read_text().replace('"roll_deg": ', '"roll_deg": 1'))
-    command = ["export", plan, "--format", "csv", "--out", copy]
-    refused_command(command, capfd, "output_not_whole", "does not match its entry")
+    refused_command(
+        ["export", plan, "--format", "csv", "--out", copy], capfd, "output_not_whole", "does not match its entry"
+    )
+    loose = tmp_path / "loose.json"
+    shutil.copy(rehearsed / "plan.json", loose)
+    assert main(["export", str(loose), "--format", "csv", "--out", str(tmp_path / "out")]) == OK
+    said = capfd.readouterr().err
+    assert "not part of an output set" in said and len(said.splitlines()) == 1
 
 
 def test_an_export_lists_what_decided_it(rehearsed, tmp_path, run):
@@ -199,8 +223,7 @@ def test_check_draws_slices(carton, run, tmp_path):
     """Of a refused direction too, as an entry of the folder's set; what is no PNG is refused."""
     arguments = ["check", carton, "--theta", 45, "--beta", 270, "--no-arm", "--picture"]
     code, found = run(*arguments, tmp_path / "one.png")
-    switched_off = "not checked: switched off (--no-arm)"
-    assert (code, found["verdict"], found["arm"]) == (ANSWER_IS_NO, "rejected", switched_off)
+    assert (code, found["verdict"]) == (ANSWER_IS_NO, "rejected")
     assert Image.open(tmp_path / "one.png").format == "PNG"
     assert list(read_manifest(tmp_path).entries) == ["check one.png"] and problems(tmp_path) == ()
     assert main([*map(str, arguments), str(tmp_path / "one.jpg")]) == BAD_INPUT
@@ -217,6 +240,13 @@ def test_check_explains_a_refusal(carton, capfd):
     assert "-1.00 mm clearance" not in said and "too close, crossed" in said
     for line in ("skin entry", "path length", "skin angle", "standoff", "bolt_l", "arm reaches it"):
         assert line in said
+
+
+def test_an_arm_that_was_switched_off_is_named(carton, run):
+    """--no-arm on a case that says where the base is: the verdict is for the organs, and why is said."""
+    code, found = run("check", carton, "--theta", 0, "--beta", 0, "--no-arm")
+    assert (code, found["arm"]) == (OK, "not checked: switched off (--no-arm)")
+    assert not any("states a robot" in warning for warning in found["warnings"])
 
 
 def test_an_arm_that_is_asked_for_must_have_a_base(carton, tmp_path, capfd):
@@ -239,3 +269,20 @@ def test_a_bug_is_exit_code_3(monkeypatch, capfd):
     monkeypatch.setattr("puncture_twin.twin.jobs.papers.papers.PAPERS", {"chen2019": lambda *_: 1 / 0})
     assert main(["reproduce", "chen2019"]) == PROGRAM_FAILED
     assert "ZeroDivisionError" in capfd.readouterr().err
+
+
+def test_progress_in_a_log_is_a_line_now_and_then(monkeypatch):
+    """No bars where nobody watches: a line with rate and remaining time, at most every few seconds."""
+    stream = io.StringIO()
+    clock = iter(range(0, 1000, 3))
+    monkeypatch.setattr("puncture_twin.twin.report.progress.LINE_EVERY_S", 5.0)
+    monkeypatch.setattr("puncture_twin.twin.report.progress.time.monotonic", lambda: float(next(clock)))
+    display = progress_display(stream)
+    assert isinstance(display, LineDisplay)
+    with display:
+        for done in range(1, 9):
+            display.count("directions", done, 8)
+    lines = stream.getvalue().splitlines()
+    assert 1 < len(lines) <= 8
+    assert lines[0] == "directions: 1/8"  # no time is behind it: a rate would be made up
+    assert all("directions: " in line and "/min, " in line and "s left" in line for line in lines[1:])

@@ -1,6 +1,7 @@
 """Several ways of guidance on one page: the numbers of the single runs, the worse one readable as worse."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -61,14 +62,24 @@ def test_each_way_has_the_numbers_of_its_own_run(compared, plan):
 
 
 def test_the_page_shows_them_best_first(compared):
-    """The order is that of the errors; what is worse says so, with its factor."""
+    """The order is that of the errors; what is worse says so, in the cards and in the table, with its factor."""
     document, out, _ = compared
     page, rows = (out / "ways.html").read_text(), document["ways"]
     assert [row["rating"] for row in rows] == ["best", "worse", "worse"] and rows[0]["guidance"] == "ct+us"
     errors = [row["realised_rms_mm"] for row in rows]
     assert errors == sorted(errors)
+    cards = re.findall(r'<div class="card( bad)?">\s*<p class="name">([^<]*)', page)
+    assert [(name, bool(bad)) for bad, name in cards] == [
+        (f"{row['guidance']}: {row['rating']}", row["rating"] == "worse") for row in rows
+    ]
     for row in rows[1:]:
         assert f"worse: error ×{row['realised_rms_mm'] / errors[0]:.2f}" in page
+    for row in rows:
+        shown = (row["realised_rms_mm"], row["predicted_rms_mm"])
+        cells = "".join(f"<td>{value:.2f}</td>" for value in shown)
+        assert re.search(rf"<td>{re.escape(row['guidance'])}</td><td>[^/]*(?:</b>)?</td>{cells}", page)
+    assert all(name in page for name in ("PubMed 36863276", "10.1007/s11548-015-1286-y", "assumed, not measured"))
+    assert (out / "ways.png").read_bytes().startswith(b"\x89PNG")
     assert {"ways.html", "ways.png", "ways.json", "plan.json", "report.html"} <= set(document["files"])
 
 

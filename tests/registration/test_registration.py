@@ -6,18 +6,18 @@ from hypothesis import given, settings, strategies as st
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from benchmarks.one_insertion import held
+from benchmarks.one_insertion import T, held, markers_of
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import apply, frame_about, pose
 from puncture_twin.planning.registration.fit_uncertainty import touching_configuration
-from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
+from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import conditioning
+from puncture_twin.planning.registration.residuals import conditioning, leverage
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, radius_for_chance
-from puncture_twin.twin.experiment.chen2019 import TABLE_1
+from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])
 MARKERS = np.array([TABLE_1[name] for name in "ABCE"], dtype=float)
@@ -51,6 +51,25 @@ def test_rigid_agrees_with_scipy():
     np.testing.assert_allclose(fit_rigid(MARKERS, base)[:3, :3], R, atol=1e-9)
 
 
+def test_affine_recovers_a_shear():
+    """The 12-parameter fit follows what a rigid one cannot."""
+    shear = np.eye(4)
+    shear[0, 1] = 0.3
+    np.testing.assert_allclose(fit_affine(MARKERS, apply(shear, MARKERS)), shear, atol=1e-9)
+
+
+def test_expected_tre_agrees_with_monte_carlo():
+    """Fitzpatrick's formula is within 3 % of 4,000 simulated registrations (spec: within 2 %, plus sampling)."""
+    rng = np.random.default_rng(1)
+    fle = 1.0
+    errors = []
+    for _ in range(4000):
+        noisy = MARKERS + rng.normal(0, fle / np.sqrt(3), MARKERS.shape)
+        errors.append(np.sum((apply(fit_rigid(MARKERS, noisy), TARGET) - TARGET) ** 2))
+    simulated = np.sqrt(np.mean(errors))
+    assert leverage(MARKERS, TARGET[None])[0] * fle == pytest.approx(simulated, rel=0.03)
+
+
 @pytest.mark.parametrize(("names", "flags"), [("ABC", 0), ("ABE", 0), ("ACD", 3), ("ABCE", 0), ("ABCDE", 0)])
 def test_the_three_flags_trip_on_acd_alone(names, flags):
     """Of the paper's marker sets only A-C-D is weak, and by all three measures."""
@@ -61,6 +80,15 @@ def test_the_three_flags_trip_on_acd_alone(names, flags):
         assert found.spread_ratio == pytest.approx(0.11, abs=0.005)
         assert found.altitude_mm == pytest.approx(15, abs=0.5)
         assert found.leverage == pytest.approx(6.4, abs=0.05)
+
+
+def test_small_residuals_do_not_mean_a_small_error():
+    """A-B-E has FRE 0.20 mm and misses M by 2.47 mm: FRE is not the accuracy."""
+    ct = np.array([TABLE_1[name] for name in "ABE"], dtype=float)
+    base = np.array([TABLE_4[name] for name in "ABE"])
+    found = register(pairs(ct, base), method="rigid", target_ct=TARGET)
+    assert found.fre_mm == pytest.approx(0.20, abs=0.01)
+    assert np.linalg.norm(apply(found.T_base_ct, TARGET) - TABLE_4["M"]) > 2.4
 
 
 @pytest.mark.parametrize(
@@ -131,3 +159,13 @@ def test_the_radius_is_the_chance_the_other_way_round(freedom):
             chance, abs=1e-3
         )
     assert radius_for_chance(np.zeros((3, 3)), 0.95, freedom) == 0.0
+
+
+def test_without_declared_errors_it_is_fitzpatricks_formula():
+    """The trace of the covariance, at the markers' middle and far away."""
+    points = markers_of(5)
+    pairs = MarkerPairs(tuple("ABCDE"), points, apply(T, points) + 0.2 * np.random.default_rng(2).normal(size=(5, 3)))
+    found = register(pairs, method="rigid", target_ct=np.zeros(3), fle_mm=1.0)
+    places = np.array([[0.0, 0.0, 40.0], [200.0, 100.0, -300.0]])
+    np.testing.assert_allclose(found.expected_tre_mm(places), leverage(points, places), rtol=0.01)
+    assert found.freedom is None

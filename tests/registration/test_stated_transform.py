@@ -360,7 +360,9 @@ def test_a_heap_on_which_hdf5_never_ends_is_refused(tmp_path):
         parse_transform(bytes(data), file)
 
 
-@pytest.mark.parametrize(("at", "layout", "value"), [(0, "<I", 2**31), (4, "<Q", 2**63), (4, "<Q", 5), (12, "<I", 99)])
+@pytest.mark.parametrize(
+    ("at", "layout", "value"), [(0, "<I", 2**31), (4, "<Q", 2**63), (4, "<Q", 5), (12, "<I", 99), (12, "<I", 0)]
+)
 def test_a_text_elsewhere_is_refused(tmp_path, at, layout, value):
     file = rewritten(tmp_path, "affine", lambda parent, _: None)
     data = bytearray(file.read_bytes())

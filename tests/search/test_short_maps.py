@@ -10,7 +10,7 @@ from places import DATA, REAL_CT
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.anatomy.unseen import cut_off
+from puncture_twin.planning.anatomy.unseen import ORGAN_MM2, cut_off
 from puncture_twin.planning.formats.labels.labelmaps import LabelEnds, LabelMap, label_ends, labelmap_of
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.containment import Side, side_of
@@ -240,7 +240,7 @@ def test_a_map_that_was_cut_at_one_face_is_cut_where_one_label_alone_ends_flat()
 
 def test_of_many_maps_with_a_label_each_two_may_end_flat_in_one_slice():
     """Where more maps go on beyond it; the last three are one label each, in a plane of their own."""
-    pair = [LabelEnds(np.full((1, 3, 2), 40), np.full((1, 3, 2), 300.0))] * 2
+    pair = [LabelEnds(np.full((1, 3, 2), 40), np.full((1, 3, 2), area_mm2)) for area_mm2 in (300.0, 310.0)]
     other = LabelEnds(np.array([[[20, 60]] * 3]), np.zeros((1, 3, 2)))
     assert cut_off(pair[0], (99, 99, 99), [pair[1], other])[1].all()
     assert not cut_off(pair[0], (99, 99, 99), [pair[1], other, other])[1].any()
@@ -263,6 +263,15 @@ def test_a_target_where_the_labels_were_blanked_is_refused(tmp_path):
         prepare(organ_case(tmp_path / "blanked", labels), arm=False)
 
 
+def test_one_label_in_two_files_is_one():
+    """An organ that the case names twice, from a label map and from a segmentation; another one beside it counts."""
+    last = np.array([[[4, 30], [5, 20], [6, 9]], [[9, 25], [7, 22], [6, 40]]])
+    flat_mm2 = np.where([[[0, 0], [0, 0], [1, 0]]], 300.0, np.zeros((2, 3, 2)))
+    own, other = (LabelEnds(last[[row]], flat_mm2[[row]]) for row in (0, 1))
+    assert not cut_off(own, (50, 50, 50), [own])[1].any()
+    assert cut_off(own, (50, 50, 50), [own, other])[1].tolist() == [[0, 0, 2], [0, 0, 0]]
+
+
 REAL_MAPS = [
     *(REAL_CT / f"labels_{name}.nii.gz" for name in ("v1_normal", "v2_fast")),
     DATA / "slicer_chest_ct4" / "Segmentation.seg.nrrd",
@@ -283,6 +292,10 @@ def test_where_real_labels_were_blanked_is_known_and_nowhere_else(file):
             planes, flat = cut_off(ends, kept.shape)
             known, sides = known + (flat[end, axis] > 0 and planes[end, axis] == at - 0.5), sides + 1
     assert known >= 0.95 * sides > 0
+    planes, flat = cut_off(whole, labels.labels.shape)
+    assert not flat.any()
+    last, own = whole.last.transpose(0, 2, 1), np.array([np.zeros(3), labels.labels.shape]) - [[0], [1]]
+    assert whole.flat_mm2.transpose(0, 2, 1)[last != own].max() < 0.4 * ORGAN_MM2
     rng, called, sides = np.random.default_rng(1), 0, 0
     inside = np.array(labels.labels.shape) - 1.0
     for _ in range(500):

@@ -62,6 +62,17 @@ def test_it_reaches_the_bound():
     assert np.mean(chi2) == pytest.approx(freedom, abs=4 * np.sqrt(2 * freedom / DRAWS))
 
 
+def test_more_pictures_and_better_ones_help(one):
+    """The bound falls with a second stay's pictures for the ball, and with four frames each step."""
+    few, many = (bound(s.observed, s.guess, s.truth) for s in (simulate(0, stays=1), simulate(0, stays=8)))
+    four = one.observed.pixel_covariance / 4
+    sharper = bound(type(one.observed)(**{**vars(one.observed), "pixel_covariance": four}), one.guess, one.truth)
+    plain = bound(one.observed, one.guess, one.truth)
+    ball = [np.trace(a.offset(12, TARGET).ball_covariance) for a in (few, many, plain, sharper)]
+    assert ball[1] < ball[0]
+    assert ball[3] < ball[2]
+
+
 def test_the_offset_knows_that_ball_and_target_err_together(one):
     """What the cameras get wrong at both cancels: the covariance of the difference is not the sum."""
     found = joint_model.adjust(one.observed, one.guess).offset(-1, TARGET)
@@ -112,6 +123,19 @@ def found():
     return joint_model.adjust(session.observed, session.guess)
 
 
+def test_the_rods_slopes_are_differences():
+    """All 26 columns, shift and turn, at an arm that errs, by central differences."""
+    rng = np.random.default_rng(4)
+    eta = 1e-3 * rng.normal(size=joint_model.N_ROD)
+    q = np.array([[0.3, -1.2, 1.4, -1.7, -1.5, 0.4], [0.1, -1.0, 1.1, -1.6, -1.3, 0.2]])
+    slopes = joint_model.rod_poses(HELD, eta, q).slopes
+    for column, step in enumerate(1e-5 * np.eye(joint_model.N_ROD)):
+        up, down = joint_model.rod_poses(HELD, eta + step, q), joint_model.rod_poses(HELD, eta - step, q)
+        np.testing.assert_allclose((up.ball - down.ball) / 2e-5, slopes[:, :3, column], atol=1e-6)
+        turn = log_rotation(up.R_base_flange @ down.R_base_flange.swapaxes(1, 2)) / 2e-5
+        np.testing.assert_allclose(turn, slopes[:, 3:, column], atol=1e-8)
+
+
 def unseen(found, target_m):
     """The needle where the last stay's command sends it, without its look."""
     return joint_model.open_loop_error(found, found.model.observed.q_command[-1], target_m)
@@ -137,6 +161,21 @@ def test_what_each_unknown_does_to_the_needle_is_a_difference(found, of):
         slope = np.concatenate([up.offset_m - down.offset_m, turn]) / (2 * h)
         scale = max(np.abs(slope).max(), 1e-3)
         np.testing.assert_allclose(grown, np.outer(slope, slope), atol=2e-4 * scale**2)
+
+
+def test_the_servo_takes_the_arm_out_of_the_tip_but_not_out_of_the_direction():
+    """An arm that is declared five times as bad leaves the tip as seen, and spoils tip unseen and direction."""
+    session, target = simulate(3), CASE.targets.points[1]
+    five = {key: 5 * getattr(CASE.errors, key) for key in ("link_mm", "joint_deg", "twist_deg")}
+    exact_tip = session.observed.errors.model_copy(update={"tip_offset_mm": 0.0})
+    worse = exact_tip.model_copy(update=five)
+    good, bad = (
+        joint_model.adjust(replace(session.observed, errors=errors), session.guess) for errors in (exact_tip, worse)
+    )
+    tips = [np.trace(way(fit, target).tip_covariance) for fit in (good, bad) for way in (seen, unseen)]
+    assert tips[2] == pytest.approx(tips[0], rel=0.05)
+    assert tips[0] < tips[1] < tips[3]
+    assert seen(bad, target).direction_rms > 1.5 * seen(good, target).direction_rms
 
 
 def test_what_no_camera_sees_stays(found):

@@ -9,14 +9,14 @@ from scipy.linalg import block_diag
 from scipy.stats import binom
 from selfcal_world import as_estimate, joined
 
-from benchmarks.selfcal_rooms import Kind, compared, outcome, recorded, room_of
+from benchmarks.selfcal_rooms import Kind, outcome, recorded, room_of
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq import equation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import PLAY_SIGN, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import Whitening, plain_fit, weighed, with_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.pose_choice import aim, choose_poses, drawing, expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.pose_choice import aim, drawing
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.plant.simulated_recording import simulate_recording
 from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell
@@ -24,6 +24,8 @@ from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell
 ROOMS = 16
 """A covariance that is a third too small, or a half too large, moves the mean of e^T C^-1 e / p out of its bounds: 18
 parameters leave a room a standard deviation of .33, the mean of sixteen .08."""
+PICTURED = 3
+"""Rooms of rendered pictures, a second and a half each: their mean of e^T C^-1 e / p is known to .19."""
 ALL = equation.active_columns(scale=False, direction=True)
 NOISE = Noise(0.0, 0.0, 0.1, float(np.radians(0.3)), off_plane_mm=0.15)
 
@@ -207,6 +209,25 @@ def test_a_direction_counts_by_how_much_of_the_shaft_shows():
     assert np.mean(narrower) > 0.8
 
 
+def test_the_region_holds_the_truth_of_rendered_pictures():
+    """Detected tips and directions, play, and noise found: as often as the binomial distribution allows (99.9 %)."""
+    kind = Kind(told=False, rendered=True, play_deg=0.02)
+    rooms = [outcome(kind, seed) for seed in range(PICTURED)]
+    assert sum(one.inside for one in rooms) >= binom.ppf(0.001, PICTURED, 0.95)
+    assert np.mean([one.mahalanobis for one in rooms]) < 1.35
+
+
+def test_the_arms_errors_take_a_third_off_the_held_out_error(outcomes):
+    """Beside the same rooms calibrated as if all errors were noise; whose region holds the truth in hardly any."""
+    noise_alone = [outcome(Kind(arms=0.0), 1000 + seed) for seed in range(ROOMS // 2)]
+    rms = [
+        np.sqrt(np.mean(np.concatenate([one.errors_mm for one in rooms]) ** 2))
+        for rooms in (noise_alone, outcomes["told"][: ROOMS // 2])
+    ]
+    assert rms[1] < 0.72 * rms[0]
+    assert sum(one.inside for one in noise_alone) <= 1
+
+
 def test_arms_declared_too_small_show_in_chi_squared():
     """Declared at a quarter, chi-squared over its freedom is above the limit of the warning on average."""
     small = [outcome(Kind(arms=0.25), 1000 + seed).chi2_per_freedom for seed in range(6)]
@@ -235,24 +256,6 @@ def test_the_aim_counts_the_needle_arms_errors(room):
             gaps.append(np.linalg.norm(ended - np.append(target, 0.0)))
         missed[name] = np.sqrt(np.nanmean(np.square(gaps)))
     assert missed["counted"] < 0.8 * missed["left"]
-
-
-def test_the_bound_of_chosen_poses_counts_arms_that_err_alike(room):
-    """As the calibration does: it is the error in hidden rooms, and higher than without them."""
-    case, candidates, _, _ = room
-    poses, arms, belief = candidates.poses, case.declared_arms, drawing(case)
-    chosen = choose_poses(poses, 30, NOISE, belief)
-    bound = expected_tre_mm(poses.subset(chosen), NOISE, belief, poses, arms)
-    assert expected_tre_mm(poses.subset(chosen), NOISE, belief, poses) < 0.8 * bound
-    squared = []
-    for seed in range(10):
-        rng = np.random.default_rng([7, seed])
-        truth = draw_workcell(case, rng)
-        recording, _ = recorded(case, candidates, truth, chosen, rng, noise=True)
-        found = calibrate(recording, noise=NOISE, arms=arms, direction=False)
-        held = recorded(case, candidates, truth, np.setdiff1d(np.arange(len(poses)), chosen)[::12], rng, noise=False)
-        squared.append(compared(found, truth, *held).errors_mm ** 2)
-    assert np.sqrt(np.mean(squared)) == pytest.approx(bound, rel=0.2)
 
 
 def test_the_needle_length_and_declared_arms_go_together(room):

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from refusals import refused, refused_command
-from scipy.stats import binom
 from selfcal_world import as_estimate, tre
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
@@ -83,10 +82,19 @@ def test_shots_are_the_calibration_of_all_poses(taken):
     assert since < before
 
 
+def test_the_order_of_shots_does_not_matter(taken):
+    _, found, recording = taken
+    rows = np.arange(FIRST, ALL)
+    one = after(ShotByShot.of(found), recording, rows).calibration()
+    other = after(ShotByShot.of(found), recording, np.random.default_rng(1).permutation(rows)).calibration()
+    np.testing.assert_allclose(one.parameter_error(other.estimate), 0.0, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-8, atol=1e-15)
+
+
 def test_the_region_after_shots_holds_the_truth_as_often_as_it_says():
-    """In 60 rooms, each with poses and noise of its own, as far as they can tell (99.9 %); few true shots refused."""
+    """In 200 rooms, each with poses and noise of its own: 93 to 97 % inside the 95 % region; few true shots refused."""
     inside, refused_shots = [], 0
-    for seed in range(60):
+    for seed in range(200):
         rng = np.random.default_rng([7, seed])
         truth = draw_truth(rng)
         exact = exact_recording(truth, draw_probe_poses(rng, truth, 26), draw_image_poses(rng, 26))
@@ -98,8 +106,8 @@ def test_the_region_after_shots_holds_the_truth_as_often_as_it_says():
         found = followed.calibration()
         e = found.parameter_error(as_estimate(truth))
         inside.append(e @ np.linalg.solve(found.covariance, e) <= found.region_limit())
-    assert binom.ppf(0.0005, 60, 0.95) <= sum(inside) <= 60
-    assert refused_shots <= 3  # one in a thousand is expected, of 360
+    assert 0.93 <= np.mean(inside) <= 0.97
+    assert refused_shots <= 5  # one in a thousand is expected
 
 
 def test_a_shot_that_does_not_fit_changes_nothing(taken):

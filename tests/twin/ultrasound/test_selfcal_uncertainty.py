@@ -67,6 +67,16 @@ def test_the_prediction_is_the_mean_over_the_needles_orientations(rng):
     assert found.predicted_tre_mm(p, A)[0] == pytest.approx(np.sqrt(np.mean(squared)), rel=1e-9)
 
 
+def test_the_error_grows_away_from_what_was_recorded(rng):
+    """Outside the recorded field the tip is known worse; far away the prediction grows with the distance."""
+    recording, _ = simulate_recording(rng, 30)
+    found = calibrate(recording, noise=SPEC_NOISE)
+    points = np.array([[0.0, 35.0], [0.0, 120.0], [0.0, 5000.0], [0.0, 10000.0]])
+    near, beyond, far, twice = found.predicted_tre_mm(points, recording.A[0])
+    assert beyond > 1.2 * near
+    assert twice / far == pytest.approx(2, rel=0.05)
+
+
 def test_the_noise_ratio_says_when_the_noise_is_larger_than_told(rng):
     """Told a third of the noise, the residuals are three times as large as expected."""
     recording, _ = simulate_recording(rng, 60)
@@ -153,6 +163,25 @@ def test_a_quarter_of_gross_outliers_is_still_found(rng):
     found = calibrate(broken, noise=SPEC_NOISE)
     assert {recording.names[row] for row in rows} == set(found.outliers)
     np.testing.assert_array_equal(found.weights == 0, np.isin(recording.names, found.outliers))
+
+
+def test_a_clean_recording_loses_nothing(rng):
+    """Nearly every one keeps all of its poses (1 % may lose one), and then each counts in full."""
+    found = [calibrate(simulate_recording(rng, 25)[0], noise=SPEC_NOISE) for _ in range(20)]
+    whole = [one for one in found if one.outliers == ()]
+    assert len(whole) >= 18
+    for one in whole:
+        np.testing.assert_array_equal(one.weights, 1.0)
+
+
+def test_directions_that_point_backwards_are_set_aside(rng):
+    """A detector that takes the shaft's end for the tip turns v round: V does not follow, the tips still count."""
+    recording, truth = simulate_recording(rng, 30)
+    v = np.array(recording.v)
+    v[[3, 11, 20]] *= -1
+    found = calibrate(Recording(recording.A, recording.B, recording.P, v), noise=SPEC_NOISE)
+    assert found.outliers == calibrate(recording, noise=SPEC_NOISE).outliers
+    assert np.degrees(np.arccos(found.needle_direction_end2 @ truth.direction_end2)) < 0.2
 
 
 def test_a_recording_that_nobody_can_read_is_refused(rng):
