@@ -57,13 +57,14 @@ def commands(folder: Path) -> Iterator[Command]:
 
 
 def real_case(folder: Path) -> Path:
-    """The real CT at 1 degree, with its data beside it."""
+    """The real CT at 1 degree, with its data beside it; no arms beside the trunk, so that the robot reaches it."""
     for file in (REPOSITORY / "tests" / "real").iterdir():
         shutil.copy(file, folder)
     for file in DATA.glob("*.nii.gz"):
         (folder / file.name).symlink_to(file)
     case = folder / "case_v2.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 1.0"))
+    text = case.read_text().replace("step_deg = 2.0", "step_deg = 1.0")
+    case.write_text(text.replace("[end]", '[ct]\narms = "none"\n\n[end]'))
     return case
 
 

@@ -52,8 +52,9 @@ VOXELS_OF_SLACK, CELL_MM = 1.0, 2.0
 """A map may end so many voxels inside the skin's box: the skin itself is found to that. And the least edge of the cells
 by which the body beyond a map is found; it is widened by one cell to all sides."""
 FEWEST_FLAT, ORGAN_MM2 = 2, 2000.0
-"""So many labels that end flat in one plane, with nothing beyond, were cut there, or one with so large an end: of the
-real abdomen's labels none ends by itself flat over more than 800 mm2, and no two in one outermost plane."""
+"""So many labels that end flat in one plane, with nothing beyond, were cut there, or one with so large an end that does
+not end flat on the other side too, as a block does: of the real abdomen's labels none ends by itself flat over more
+than 800 mm2, and no two in one outermost plane."""
 ENDS = (
     "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
 )
@@ -309,7 +310,8 @@ def _outermost(ends: LabelEnds) -> tuple[Ints, Ints, Ints]:
     """A map's outermost slices; how many of its labels end flat there, and as how many they count: shapes (2, 3)."""
     plane = np.stack([ends.last.min(axis=0)[:, 0], ends.last.max(axis=0)[:, 1]])
     flat_mm2 = np.where(ends.last == plane.T, ends.flat_mm2, 0.0)
-    weight = np.where(flat_mm2 >= ORGAN_MM2, FEWEST_FLAT, flat_mm2 > 0.0).sum(axis=0).T
+    alone = (flat_mm2 >= ORGAN_MM2) & (ends.flat_mm2[:, :, ::-1] == 0.0)
+    weight = np.where(alone, FEWEST_FLAT, flat_mm2 > 0.0).sum(axis=0).T
     return plane, np.count_nonzero(flat_mm2, axis=0).T, weight
 
 
