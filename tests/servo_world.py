@@ -52,12 +52,12 @@ def start_configurations():
     return configurations(HELD, np.concatenate([grid_points(CASE), targets]), NoContacts()).q
 
 
-def simulate(seed):
-    """A session up to the marker pictures and two stays at targets, everything with normal errors."""
+def simulate(seed, stays=2):
+    """A session up to the marker pictures and a few stays at targets, everything with normal errors."""
     rng = np.random.default_rng(seed)
     workcell = draw_workcell(CASE, rng)
     cameras = workcell.cameras
-    q = start_configurations()[:14]
+    q = start_configurations()[: 12 + stays]
     spread = np.sqrt(workcell.arm.repeatability**2 + workcell.arm.backlash**2 / 4)
     spheres = workcell.ball_c(q + rng.normal(0.0, spread, q.shape))
     pixels, markers = ([c.project(p) for c in cameras] for p in (spheres, workcell.markers_c))

@@ -307,9 +307,13 @@ def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = 
 
 
 def _outermost(ends: LabelEnds) -> tuple[Ints, Ints, Ints]:
-    """A map's outermost slices; how many of its labels end flat there, and as how many they count: shapes (2, 3)."""
+    """A map's outermost slices; how many of its labels end flat there, and as how many they count: shapes (2, 3).
+
+    A label that ends flat on both sides along two axes is a block, drawn so, and counts as none.
+    """
     plane = np.stack([ends.last.min(axis=0)[:, 0], ends.last.max(axis=0)[:, 1]])
-    flat_mm2 = np.where(ends.last == plane.T, ends.flat_mm2, 0.0)
+    block = np.count_nonzero(ends.flat_mm2.all(axis=2), axis=1) >= 2
+    flat_mm2 = np.where((ends.last == plane.T) & ~block[:, None, None], ends.flat_mm2, 0.0)
     alone = (flat_mm2 >= ORGAN_MM2) & (ends.flat_mm2[:, :, ::-1] == 0.0)
     weight = np.where(alone, FEWEST_FLAT, flat_mm2 > 0.0).sum(axis=0).T
     return plane, np.count_nonzero(flat_mm2, axis=0).T, weight

@@ -238,11 +238,22 @@ def test_a_map_that_was_cut_at_one_face_is_cut_where_one_label_alone_ends_flat()
     assert cut_off(LabelEnds(last, flat_mm2), (99, 99, 99))[1].tolist() == [[0, 0, 2], [0, 1, 0]]
 
 
+def test_blocks_that_somebody_drew_were_not_cut():
+    """Two boxes with a face in one plane, and a large one: flat at all sides; what a slab was cut from is at two."""
+    last = np.array([[[10, 40]] * 3, [[10, 60], [20, 30], [15, 45]]])
+    sides = np.ones((2, 3, 2))
+    slab = sides * np.array([0.0, 0.0, 1.0])[:, None]
+    assert not cut_off(LabelEnds(last, 3000.0 * sides), (99, 99, 99))[1].any()
+    assert cut_off(LabelEnds(last, 300.0 * slab), (99, 99, 99))[1].tolist() == [[0, 0, 0], [0, 0, 0]]
+    last[1, 2] = last[0, 2]
+    assert cut_off(LabelEnds(last, 300.0 * slab), (99, 99, 99))[1].tolist() == [[0, 0, 2], [0, 0, 2]]
+
+
 def test_of_many_maps_with_a_label_each_two_may_end_flat_in_one_slice():
     """Where more maps go on beyond it; the last three are one label each, in a plane of their own."""
-    pair = [LabelEnds(np.full((1, 3, 2), 40), np.full((1, 3, 2), area_mm2)) for area_mm2 in (300.0, 310.0)]
+    pair = [LabelEnds(np.full((1, 3, 2), 40), np.array([[[area_mm2, 0.0]] * 3])) for area_mm2 in (300.0, 310.0)]
     other = LabelEnds(np.array([[[20, 60]] * 3]), np.zeros((1, 3, 2)))
-    assert cut_off(pair[0], (99, 99, 99), [pair[1], other])[1].all()
+    assert cut_off(pair[0], (99, 99, 99), [pair[1], other])[1][0].all()
     assert not cut_off(pair[0], (99, 99, 99), [pair[1], other, other])[1].any()
 
 
