@@ -193,15 +193,14 @@ class LooseParts(NamedTuple):
     """The connected parts of a surface."""
 
     corners: Floats  # shape (k, 3), mm: a corner of each
-    sizes: Floats  # shape (k, 3), mm: the edges of the box about each
-    lengths: Floats  # shape (k,), mm: the diagonal of that box
+    lengths: Floats  # shape (k,), mm: the diagonal of the box about each
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> LooseParts:
         """The connected parts of a checked mesh."""
         points, begins = _in_parts(mesh)
         sizes = np.maximum.reduceat(points, begins) - np.minimum.reduceat(points, begins)
-        return cls(points[begins], sizes, np.linalg.norm(sizes, axis=1))
+        return cls(points[begins], np.linalg.norm(sizes, axis=1))
 
 
 def connected_parts(mesh: TriangleMesh) -> list[Floats]:

@@ -468,5 +468,5 @@ def test_the_loose_parts_of_a_surface_are_those_that_share_corners():
         [one, TriangleMesh(np.concatenate([np.full((1, 3), 1e3), other.vertices]), other.faces + np.int32(1))]
     )
     parts = LooseParts.of(both)
-    assert parts.sizes == pytest.approx(np.stack([np.ptp(m.vertices, axis=0) for m in (one, other)]))
+    assert parts.lengths == pytest.approx([np.linalg.norm(np.ptp(m.vertices, axis=0)) for m in (one, other)])
     assert (np.abs(parts.corners - [[0.0, 0.0, 0.0], [400.0, 0.0, 0.0]]).max(axis=1) <= 100.0).all()
