@@ -99,7 +99,7 @@ def _corner(token: str, n_vertices: int, where: str) -> int:
         refuse(f"face corner {token[:40]!r}", where, allowed, "not_a_number")
     index = int(token.split("/")[0])
     if index == 0 or abs(index) > n_vertices:
-        refuse(f"face uses vertex {index} of {n_vertices}, out of range", where, allowed, "index_out_of_range")
+        refuse(f"the line names vertex {index} of {n_vertices}, out of range", where, allowed, "index_out_of_range")
     return index - 1 if index > 0 else n_vertices + index
 
 
