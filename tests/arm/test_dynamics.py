@@ -220,7 +220,7 @@ def test_the_tip_is_off_its_path_as_the_covariance_says(moved, rng):
     rows = np.arange(0, len(error_mm), 16)  # of .5 ms; a sample of the reference is 8 ms
     told = told[: len(rows)]
     assert error_mm.max() > 0.05
-    assert np.abs(told - error_mm[rows]).max() < 0.1 * error_mm.max()
+    assert np.abs(told - error_mm[rows]).max() < 0.06 * error_mm.max()
 
 
 def test_the_command_identifies_what_it_recorded(tmp_path, capsys):

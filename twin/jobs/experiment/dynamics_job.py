@@ -184,17 +184,21 @@ def _loop(model: UrModel, found: Identified, q: Floats, J: Floats, down_base: Fl
 
 
 def tip_covariances(case: Case, found: Identified, insertion: Trajectory, down_base: Floats) -> Floats:
-    """Covariance of the tip about its path, shape (m, 3, 3), mm^2, base frame, by the equation above."""
+    """Covariance of the tip about its path, shape (m, 3, 3), mm^2, base frame, by the equation above.
+
+    A sample's step takes the wrench of its middle: friction begins and ends with the motion, at once.
+    """
     model, tip_m = case.robot.model, float(to_m(case.needle.length_mm))
-    reference = reference_of(model, tip_m, insertion, SAMPLE_S, HOLD_S)
+    reference = reference_of(model, tip_m, insertion, SAMPLE_S / 2, HOLD_S)
     motion = JointMotion(reference.q, reference.speed, reference.acceleration)
     Y = regressor(model, motion, down_base)[:, :, found.base.columns]
     J = tips(model, tip_m, reference.q).J
     wrench = np.linalg.solve(J.transpose(0, 2, 1), Y)
     half = len(J) // 2
     A, B = _loop(model, found, reference.q[half], J[half], down_base)
-    state, G = np.zeros((18, len(found.values))), np.empty((len(J), 3, len(found.values)))
-    for row, push in enumerate(wrench - wrench[0]):
+    pushes = wrench[1::2] - wrench[0]
+    state, G = np.zeros((18, len(found.values))), np.empty((len(pushes), 3, len(found.values)))
+    for row, push in enumerate(pushes):
         G[row] = to_mm(state[:3])
         state = A @ state + B @ push
     return np.asarray(G @ found.covariance @ G.transpose(0, 2, 1))
