@@ -31,13 +31,11 @@ from puncture_twin.planning.clearance.fast_engine import near_faces
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.reach.standoff import case_axis_lengths
-from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touching_configuration
-from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.fits import FitUncertainty, Method, NoiseTest, fit_rigid
+from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.method import Method
-from puncture_twin.planning.registration.placement import aimed, load_placement
-from puncture_twin.planning.registration.registration import aim_at, register
-from puncture_twin.planning.registration.residuals import NoiseTest
+from puncture_twin.planning.registration.placement import aim_at, aimed, load_placement
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding, refined_chances

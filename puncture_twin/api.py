@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from puncture_twin.planning.geometry.mesh import TriangleMesh
     from puncture_twin.planning.place.search import PlaceSearch
     from puncture_twin.planning.plan.plan import Plan
+    from puncture_twin.planning.registration.fits import Method
     from puncture_twin.planning.registration.hand_eye import HandEye, PosePairs
-    from puncture_twin.planning.registration.method import Method
     from puncture_twin.planning.registration.registration import Registration
     from puncture_twin.planning.search.candidates import Candidates, Pick
     from puncture_twin.planning.search.context import CaseContext, EngineChoice

@@ -7,9 +7,8 @@ from places import ROOT
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.budget.chain import chain_of
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise
-from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.registration import reached_insertion
+from puncture_twin.planning.registration.marker_noise import reading_noise
+from puncture_twin.planning.registration.placement import load_placement, reached_insertion
 from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
 

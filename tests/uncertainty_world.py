@@ -14,11 +14,11 @@ from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touching_configuration
 from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.placement import aimed, load_placement
-from puncture_twin.planning.registration.registration import aim_at, register
+from puncture_twin.planning.registration.placement import aim_at, aimed, load_placement
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.trials import Puncture
 

@@ -71,7 +71,7 @@ PLAIN = MappingProxyType(
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
         "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
         "puncture_twin.planning.registration.marker_pairs": REGISTRATION,
-        **{f"puncture_twin.planning.registration.{name}": REGISTRATION for name in ("fits", "method")},
+        "puncture_twin.planning.registration.fits": REGISTRATION,
         "puncture_twin.planning.registration.registration": REGISTRATION,
     }
 )

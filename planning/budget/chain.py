@@ -17,10 +17,10 @@ from puncture_twin.planning.case.settings import SAME_MM
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.needle.deflection import GAUGES, Bending, Shaft
 from puncture_twin.planning.reach.standoff import case_paths
-from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty, reading_noise, touches
-from puncture_twin.planning.registration.fits import fit_triad
+from puncture_twin.planning.registration.fits import Aim, fit_triad, fit_uncertainty
+from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.placement import aimed_uncertainty, default_method
-from puncture_twin.planning.registration.registration import Aim, Registration
+from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.uncertainty.pose_error import Bend, PoseError
 

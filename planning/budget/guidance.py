@@ -35,10 +35,10 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.needle.insertion_force import Pushed, pushed
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
-from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
+from puncture_twin.planning.registration.fits import FitUncertainty, NoiseTest
+from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.registration.residuals import NoiseTest
 from puncture_twin.planning.search.bending import path_layers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation

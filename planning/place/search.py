@@ -55,7 +55,7 @@ from puncture_twin.planning.place.mounts import (
 )
 from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touches
+from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import Placement, default_method
 from puncture_twin.planning.registration.registration import Registration, register

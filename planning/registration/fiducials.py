@@ -45,8 +45,7 @@ from puncture_twin.planning.registration.fiducial_reading import (
     find_middle,
     read_marker,
 )
-from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
-from puncture_twin.planning.registration.method import BETTER, matching, rigid_rss
+from puncture_twin.planning.registration.marker_pairs import BETTER, MIN_MARKERS, matching, rigid_rss
 
 LEVELS_HU = (150.0, 350.0, 700.0, METAL_HU, 2500.0)
 """Tried one after the other: where a marker holds together with bone at one, it is alone at a higher one."""

@@ -1,20 +1,8 @@
-"""T_base_ct by each method: rigid, mirrored, triad, affine, weighted, joint; and the map from reading errors to it.
+"""T_base_ct by each method: rigid, mirrored, triad, affine, weighted, joint; and the covariance of each fit.
 
 With A_i = [I, -[p_i - c]x] stacked and weights W, a reading error z moves the fitted pose by L z, L = (A' W A)^-1 A' W:
 a shift of the centroid c, then a rotation about it, base axes. The weighted fit is Gauss-Newton along this map:
 Moghari, Abolmaesumi, IEEE TMI 26(12), 2007; Danilchenko, Fitzpatrick, IEEE TMI 30(3), 2011.
-
-Is one list of markers scaled, stretched or sheared against the other? A rigid fit beside fits of one parameter more.
-
-A unit that is a little off, slices whose step is wrong, a gantry tilt that nobody took back: each deforms what one side
-shows, and a rigid motion leaves that to the residuals, where it looks like noise. Seven deformations of the CT's frame
-are tried, one at a time: a similarity, a stretch along each axis, a shear in each plane. With z the residuals of the
-rigid fit, whitened by what is declared of the readings, A its design and d the column of a deformation:
-
-    F = (SSE_6 - SSE_7) / (SSE_7 / (3 N - 7))   follows F(1, 3 N - 7) where there is none,
-
-and the best one's probability counts seven times (Bonferroni). It is reported and never applied: a marker that was
-misread can look the same.
 
 The covariance of markers read in a CT and touched by an arm: y_i = T x_i - J_i eta - Jq_i eps_i + n_i, stacked.
 """
@@ -23,15 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from scipy.special import chdtrc, chdtri, fdtri
 
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import Finding, Severity
-from puncture_twin.planning.geometry.gauss_newton import lacking
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_of_points, log_rotation, pose, skew
-from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration import fits
 
 NUDGE_MM = 1e-4
 """Of central differences of a method that has no formula of its own; their error is 1e-9 of the map."""
@@ -177,107 +166,51 @@ def _gauss_newton(
     return pose(U @ Vt, t)
 
 
-SIGNIFICANT, SURE = 0.05, 0.01
-"""True lists look so deformed once in 20 registrations, and once in 100: it is said, and nothing is refused for it.
-Where one axis is read five times as badly as the others and nobody declares it, the second is up to one in ten (1,000
-draws each, 3 to 12 markers)."""
-LEAST_MM = 0.05
-"""Rms of what a deformation moves the markers by, below which it does not matter, however sure it is."""
-KINDS = ("xyz", "x", "y", "z", "xy", "xz", "yz")
-"""A similarity, three stretches, and shears: the first axis runs askew along the second."""
+Method = Literal["triad", "rigid", "weighted", "joint", "affine"]
+Fit = Callable[[Floats, Floats], Floats]
+"""From points (..., n, 3) in both frames, mm, to T_base_ct."""
+LEAST_FOUND_MM = 0.01
+"""FRE from which on the markers can say how large the errors are: no arm repeats so well, so one side was computed."""
+SINGULAR = 1e-12
+"""Least over greatest variance of the readings below which some of them count as free of error."""
 
 
-@dataclass(frozen=True)
-class Distortion:
-    """The deformation that explains most of the residuals."""
+def checked_fit(
+    points_ct: Floats,
+    points_base: Floats,
+    method: Method,
+    noise: ReadingNoise | None,
+    found_in_mm: float | None,
+    *,
+    where: str | Path,
+) -> Fit:
+    """The fit of a method, which the declared noise has passed; the FRE is given where its size is to be found in it.
 
-    axes: str  # of ``KINDS``, in the case's CT frame
-    amount: float
-    """The factor less 1 by which markers_base are longer; of a shear by how much a point moves along the first axis per
-    mm along the second."""
-    probability: float  # of one so sure in any of the seven, where there is none
-    moved_mm: float  # what it moves the markers by beside a rigid motion, rms
-    reading_mm: float  # the standard deviation per coordinate that it leaves to the readings
-    rms_mm: float  # expected error at the target by the residuals of the rigid fit
-    rms_without_mm: float  # the rms by the residuals of the fit with the deformation
-
-    @property
-    def significant(self) -> bool:
-        """Whether true lists would seldom look so deformed, by so much that it matters: then it is reported."""
-        return self.probability < SIGNIFICANT and self.moved_mm >= LEAST_MM
-
-    def finding(self) -> Finding:
-        """The deformation as a warning."""
-        noise = "not noise, because" if self.probability < SURE else "probably more than noise:"
-        said = (
-            f"{self.brief()}: {noise} besides it, the readings have errors of {self.reading_mm:.2g} mm a "
-            "coordinate; without it the expected TRE at the target would be about "
-            f"{self.rms_without_mm:.1f} mm instead of {self.rms_mm:.1f}; the registration does not use this"
-        )
-        numbers: dict[str, float | str] = {"axes": self.axes, "amount": self.amount, "probability": self.probability}
-        return Finding("lists_deformed", Severity.WARNING, said, numbers)
-
-    def brief(self) -> str:
-        """How the lists differ, by how much, and how sure that is."""
-        along = "" if self.axes == "xyz" else f" along the CT's {self.axes}"
-        said = f"markers_base appear {1 + self.amount:.4f} times as large as markers_ct{along}"
-        if len(self.axes) == 2:
-            angle = np.degrees(abs(np.arctan(self.amount)))
-            said = f"the CT's frame looks {angle:.1f} degrees out of square, {self.axes[0]} against {self.axes[1]}"
-        return f"{said} (F test, p {self.probability:.2g})"
-
-
-def distortion(
-    T_base_ct: Floats, markers: MarkerPairs, noise: ReadingNoise | None, target_ct: Floats
-) -> Distortion | None:
-    """The likeliest deformation of a registration's lists; None where its markers cannot show any.
-
-    T_base_ct (4, 4) is near the least-squares fit, the error matters at target_ct (3,), mm; without noise all weigh
-    alike.
+    Raises InputError: ``affine``, ``weighted`` or ``joint`` without noise, or noise that cannot be weighed.
     """
-    fitted = apply(T_base_ct, markers.points_ct)
-    cov = np.eye(fitted.size) if noise is None else noise.covariance(T_base_ct[:3, :3]).whole
-    root = np.linalg.inv(np.linalg.cholesky(cov))
-    gaps, A = (markers.points_base - fitted).ravel(), design(fitted, fitted.mean(axis=0))
-    center_ct = markers.points_ct.mean(axis=0)
-    found = []
-    for axes in KINDS:
-        moved = _moved(axes, T_base_ct, markers.points_ct - center_ct).ravel()
-        tested = lacking(root @ gaps, root @ A, root @ moved[:, None])
-        if tested is not None:
-            found.append((tested, axes, moved))
-    if not found:
-        return None
-    best, axes, moved = min(found, key=lambda one: one[0].probability)
-    amount, back = float(best.found[0]), np.linalg.pinv(A)
-    beside, rigid = (column - A @ (back @ column) for column in (moved, gaps))
-    at, at_moved = carried(fitted.mean(axis=0), apply(T_base_ct, target_ct))[:3], target_ct - center_ct
-    whole = np.column_stack([A, moved]), np.column_stack([at, _moved(axes, T_base_ct, at_moved[None])[0]])
-    return Distortion(
-        axes,
-        amount,
-        min(1.0, len(KINDS) * best.probability),
-        abs(amount) * float(np.linalg.norm(beside)) / float(np.sqrt(len(markers))),
-        float(np.linalg.norm(rigid - amount * beside)) / float(np.sqrt(best.freedom)),
-        _weighted_rms(root @ A, at, best.variance_without),
-        _weighted_rms(root @ whole[0], whole[1], best.variance),
-    )
-
-
-def _moved(axes: str, T_base_ct: Floats, from_center_ct: Floats) -> Floats:
-    """How points (n, 3) of the CT, from the markers' centroid, move in base axes per unit of amount, shape (n, 3)."""
-    rows = ["xyz".index(axis) for axis in axes]
-    M = np.zeros((3, 3))
-    if len(axes) == 2:
-        M[rows[0], rows[1]] = 1.0
-    else:
-        M[rows, rows] = 1.0
-    return np.asarray(from_center_ct @ M.T @ T_base_ct[:3, :3].T)
-
-
-def _weighted_rms(B: Floats, X: Floats, variance: float) -> float:
-    """Expected error (rms, mm) of what X (3, p) carries from a fit of design B (m, p), whitened, to the target."""
-    return float(np.sqrt(np.trace(X @ np.linalg.inv(B.T @ B) @ X.T) * variance))
+    if method == "affine":
+        allowed = "triad, rigid or weighted; affine only reproduces the paper's Table 6"
+        refuse("method 'affine' bends the patient", where, allowed, "method_bends")
+    if method not in get_args(Method):
+        refuse(f"method {method!r}", where, ", ".join(get_args(Method)), "unknown_method")
+    weighing = method in {"weighted", "joint"}
+    if noise is None:
+        if weighing:
+            what = f"method '{method}' needs declared errors as weights"
+            refuse(what, where, "[errors], or method rigid", "method_without_errors")
+        return fit_triad if method == "triad" else fit_rigid
+    covariance = noise.covariance(fit_rigid(points_ct, points_base)[:3, :3])
+    values = np.linalg.eigvalsh(covariance.independent if weighing else covariance.whole)
+    if not values[0] > SINGULAR * values[-1]:
+        allowed = "ct_in_plane_mm, ct_slice_mm or touch_mm above 0"
+        refuse("the declared errors leave some marker readings without error", where, allowed, "no_marker_noise")
+    if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
+        message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) show none"
+        refuse(message, where, "markers measured on both sides, or marker_noise = 'declared'", "no_marker_noise")
+    if weighing:
+        weighted = fit_weighted if method == "weighted" else fit_joint
+        return lambda ct, base: weighted(ct, base, noise, fit_rigid(ct, base))
+    return fit_triad if method == "triad" else fit_rigid
 
 
 class NoiseCovariance(NamedTuple):
@@ -326,3 +259,185 @@ class ReadingNoise:
         """Omega's blocks, shape (..., N, 3, 3), one a marker, for rotations (..., 3, 3)."""
         read = R_base_ct @ self.cov_ct @ np.swapaxes(R_base_ct, -1, -2)
         return np.asarray(read[..., None, :, :] + self.cov_base)
+
+
+REJECT_LEVEL = 0.001
+"""Significance level of rejection: honest noise exceeds such residuals once in 1,000 registrations."""
+INTERVAL = 0.95
+"""Of every interval and region that is printed."""
+
+
+class Interval(NamedTuple):
+    """Lower and upper bound, mm."""
+
+    low: float
+    high: float
+
+
+WARNED = 0.01
+"""Residuals that the declared errors exceed once in 100 registrations: it is warned, and the errors are scaled."""
+
+
+@dataclass(frozen=True)
+class NoiseTest:
+    """The residuals of a weighted fit against the declared errors."""
+
+    count: int  # markers, N >= 3
+    chi_squared: float
+    """r' C^-1 r of the weighted residuals: chi-squared with 3 N - 6 degrees where the declaration holds."""
+    found: bool = False
+    """Whether the declaration gives the errors' shape alone, and the residuals their size."""
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom, nu = 3 N - 6."""
+        return 3 * self.count - 6
+
+    @property
+    def probability(self) -> float:
+        """Chance of residuals as large as these, if the declaration holds."""
+        return float(chdtrc(self.freedom, self.chi_squared))
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the residuals agree with the declaration, or nothing was declared about their size."""
+        return self.found or self.probability >= WARNED
+
+    @property
+    def explained(self) -> bool:
+        """Whether a registration with such residuals is taken at all without the case's consent."""
+        return self.found or self.probability >= REJECT_LEVEL
+
+    @property
+    def estimate(self) -> float:
+        """s, the size of the errors by the residuals over the declared one."""
+        return float(np.sqrt(self.chi_squared / self.freedom))
+
+    @property
+    def interval(self) -> Interval:
+        """The 95 % interval of the true size over the declared one: nu s^2 over chi-squared."""
+        tail = (1 - INTERVAL) / 2
+        low, high = (float(np.sqrt(self.chi_squared / chdtri(self.freedom, p))) for p in (tail, 1 - tail))
+        return Interval(low, high)
+
+    @property
+    def scale(self) -> float:
+        """Factor of the declared deviations: 1 where the declaration holds."""
+        return self.estimate if self.found or not self.agrees else 1.0
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the size is that of the residuals, so that chances follow Student's t and regions Fisher's F."""
+        return self.found or not self.agrees
+
+    @property
+    def region_factor(self) -> float:
+        """The k of the 95 % region d' Sigma^-1 d <= k^2 in three dimensions, Sigma scaled: sqrt(chi2) or sqrt(3 F)."""
+        if self.scaled:
+            return float(np.sqrt(3 * fdtri(3, self.freedom, INTERVAL)))
+        return float(np.sqrt(chdtri(3, 1 - INTERVAL)))
+
+    def text(self) -> str:
+        """What the test found, in one sentence."""
+        low, high = self.interval
+        size = f"the residuals show {self.estimate:.2f} times the declared errors (95 %: {low:.2f} to {high:.2f})"
+        if self.found:
+            return f"noise found: {size}"
+        verdict = "agree with" if self.agrees else "do not agree with"
+        return (
+            f"residuals {verdict} the declared errors (chi-squared {self.chi_squared:.1f}, {self.freedom} degrees of "
+            f"freedom, p {self.probability:.2g}); {size}"
+        )
+
+
+def noise_test(residuals: Floats, cov: Floats, A: Floats, *, found: bool = False) -> NoiseTest:
+    """Test the stacked residuals (3 N,) of any fit, whose design is A (3 N, 6), against their covariance (3 N, 3 N).
+
+    They are first freed of what the best weights would have fitted: r = M z, M = I - A (A' C^-1 A)^-1 A' C^-1.
+    """
+    weights = np.asarray(np.linalg.inv(cov), dtype=np.float64)
+    free = residuals - A @ (least_squares_map(A, weights) @ residuals)
+    return NoiseTest(len(residuals) // 3, float(free @ weights @ free), found)
+
+
+@dataclass(frozen=True, eq=False)
+class FitUncertainty:
+    """The declared errors of the markers, and the map from them to the pose; base axes, mm and rad."""
+
+    noise: ReadingNoise
+    R_base_ct: Floats  # shape (3, 3), as registered
+    center_base: Floats  # shape (3,), the markers' centroid, about which `fit_map` turns
+    fit_map: Floats  # L, shape (6, 3 N), from the stacked reading errors to shift and rotation
+    test: NoiseTest
+    """Whether the residuals agree with the declaration; its scale is not yet in the covariances below."""
+
+    @property
+    def fle_mm(self) -> float:
+        """The rms length of one marker's error, CT and touch together, scaled; the arm's own errors not counted."""
+        omega = self.noise.covariance(self.R_base_ct).independent
+        return self.test.scale * float(np.sqrt(np.trace(omega) / (len(omega) / 3)))
+
+    def map_at(self, point_base: Floats) -> Floats:
+        """X L, shape (6, 3 N): shift at a point (3,) and rotation, per reading error."""
+        return carried(self.center_base, point_base) @ self.fit_map
+
+    def cov_at(self, point_base: Floats) -> Floats:
+        """X L Omega L' X', shape (6, 6): shift (mm) at a point (3,) and rotation, from the readings alone, scaled."""
+        at = self.map_at(point_base)
+        return np.asarray(self.test.scale**2 * at @ self.noise.covariance(self.R_base_ct).independent @ at.T)
+
+    def parts_at(self, point_base: Floats) -> tuple[Floats, Floats]:
+        """`cov_at`'s part of shift, shape (3, 3) each: of the reading in the CT, and of the touch."""
+        marks = self.map_at(point_base)[:3].reshape(3, -1, 3)
+        read = self.R_base_ct @ self.noise.cov_ct @ self.R_base_ct.T
+        of_ct, of_touch = (
+            self.test.scale**2
+            * np.einsum("anb,nbc,dnc->ad", marks, np.broadcast_to(block, self.noise.cov_base.shape), marks)
+            for block in (read, self.noise.cov_base)
+        )
+        return of_ct, of_touch
+
+
+def fit_uncertainty(
+    method: str,
+    fit: Callable[[Floats, Floats], Floats],
+    T_base_ct: Floats,
+    points_ct: Floats,
+    points_base: Floats,
+    noise: ReadingNoise,
+    *,
+    found: bool,
+) -> FitUncertainty:
+    """The uncertainty of a pose (4, 4) that a method's fit gave of points (N, 3) in both frames, mm.
+
+    ``rigid``, ``weighted`` and ``joint`` have a formula; of others ``fit`` is differenced. ``found``: the residuals
+    give the errors' size.
+    """
+    R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
+    fitted = points_ct @ R.T + T_base_ct[:3, 3]
+    A, covariance = design(fitted, center), noise.covariance(R)
+    if method in {"weighted", "joint"}:
+        cov = covariance.independent if method == "weighted" else covariance.whole
+        L = least_squares_map(A, np.asarray(np.linalg.inv(cov), dtype=np.float64))
+    elif method == "rigid":
+        L = least_squares_map(A)
+    else:
+        L = differenced_map(fit, points_ct, fitted)
+    test = noise_test((points_base - fitted).ravel(), covariance.whole, A, found=found)
+    return FitUncertainty(noise, R, center, L, test)
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """The insertion for which a pose is corrected."""
+
+    target_ct: Floats  # shape (3,), mm
+    q: Floats  # shape (6,), rad, the tip on the target
+    arm_jacobian: Floats  # shape (6, 28), J_f: motion of the needle there per arm parameter, base axes
+
+    def response(self, noise: fits.ReadingNoise, weights: Floats) -> Floats:
+        """Correction of the pose at the target per residual of weights W (..., 3 N, 3 N), shape (..., 6, 3 N).
+
+        J_f Sigma_eta J' W, with Sigma_eta, J the arm's parameters and their effect on the touches.
+        """
+        return np.asarray((self.arm_jacobian * noise.eta_variances) @ noise.arm_jacobian.T @ weights)

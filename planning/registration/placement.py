@@ -18,28 +18,39 @@ best for the one insertion whose J_f was taken, and honest for all others.
 What would make a registration better: which marker to leave out, and where one more would help most.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from puncture_twin.planning.arm.inverse_kinematics import branch_of
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.inverse_kinematics import branch_of, inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import away_from_singularities, error_jacobian, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.case.tables import MarkerSection
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, marker_noise
-from puncture_twin.planning.registration.fits import ReadingNoise, carried, design, fit_joint
+from puncture_twin.planning.registration.fits import (
+    Aim,
+    FitUncertainty,
+    ReadingNoise,
+    carried,
+    design,
+    fit_joint,
+    noise_test,
+)
+from puncture_twin.planning.registration.marker_noise import marker_noise
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, check_pairs, match
-from puncture_twin.planning.registration.registration import Aim, Registration, aim_at, reached_insertion, register
-from puncture_twin.planning.registration.residuals import noise_test
+from puncture_twin.planning.registration.registration import Registration, register
 
 MAX_AIM_OFF_MM = 20.0
 """A plan's joints are at the target as it was corrected then: no nominal arm errs by so much."""
@@ -164,6 +175,36 @@ def aimed_uncertainty(
     at_center = carried(target_base, fit.center_base)  # the inverse of what carries from there to the target
     fit_map = fit.fit_map + at_center @ aim.response(fit.noise, weights) @ M
     return replace(fit, R_base_ct=T_base_ct[:3, :3], fit_map=np.asarray(fit_map))
+
+
+def aim_at(model: UrModel, tip_mm: float, target_ct: Floats, q: Floats) -> Aim:
+    """The aim of an insertion in configuration q (6,), rad, at a target (3,), mm."""
+    return Aim(target_ct, q, error_jacobian(model, q, tip_mm))
+
+
+TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
+"""Puncture angles that are tried for an insertion that the arm reaches, in this order."""
+AZIMUTHS = 12
+"""Directions tried at each."""
+
+
+def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
+    """Joints (6,), rad, that put the tip on the target, at the least puncture angle tried; None where none do.
+
+    Kinematics alone, to estimate an error: organs and collisions are not checked.
+    """
+    model, target = case.robot.model, apply(T_base_ct, case.target_ct)
+    for tilt in np.radians(TILTS_DEG):
+        azimuths = np.linspace(0, 2 * np.pi, AZIMUTHS if tilt else 1, endpoint=False)
+        local = np.array([outward(float(tilt), float(azimuth)) for azimuth in azimuths])
+        directions = local @ (T_base_ct[:3, :3] @ case.T_ct_entry[:3, :3]).T
+        q = inverse(model, flange_poses(target, directions, case.needle.length_mm)).reshape(-1, 6)
+        q = nearest_within_limits(model, q, np.zeros(6))
+        q = q[~np.isnan(q).any(axis=1)]
+        q = q[away_from_singularities(model, q)]
+        if len(q):
+            return np.asarray(q[0])
+    return None
 
 
 APART_MM = 20.0

@@ -30,10 +30,9 @@ from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
-from puncture_twin.planning.registration.checks.places import untouchable
+from puncture_twin.planning.registration.checks.markers import untouchable
 from puncture_twin.planning.registration.fits import design
-from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
-from puncture_twin.planning.registration.method import renamings
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, renamings
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.touch_planner import MOST_MARKERS, PLANNED_PADDING_MM, approach_checkers

@@ -29,11 +29,11 @@ from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool, home_configuration, outside_surface
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fit_uncertainty import marker_noise, reading_noise
+from puncture_twin.planning.registration.fits import Method
+from puncture_twin.planning.registration.marker_noise import marker_noise, reading_noise
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
-from puncture_twin.planning.registration.method import Method
-from puncture_twin.planning.registration.placement import aimed
-from puncture_twin.planning.registration.registration import Registration, aim_at, register
+from puncture_twin.planning.registration.placement import aim_at, aimed
+from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.tour_motions import (
     TIP_MM,

@@ -27,7 +27,8 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
-from puncture_twin.planning.registration.fit_uncertainty import LEAST_SINGULARITY, FitUncertainty
+from puncture_twin.planning.registration.fits import FitUncertainty
+from puncture_twin.planning.registration.marker_noise import LEAST_SINGULARITY
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.uncertainty.sources import reading_parts
 

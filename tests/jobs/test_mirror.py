@@ -25,7 +25,7 @@ from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.geometry.spaces import Unit
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
-from puncture_twin.planning.registration.fit_uncertainty import touches
+from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.live import mirror
 

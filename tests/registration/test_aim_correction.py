@@ -16,8 +16,8 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
 from puncture_twin.planning.registration.fits import differenced_map, fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.placement import aimed, aimed_fit, load_placement
-from puncture_twin.planning.registration.registration import aim_at, register
+from puncture_twin.planning.registration.placement import aim_at, aimed, aimed_fit, load_placement
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.rehearsal.trials import draw_trials
 

@@ -5,9 +5,9 @@ import pytest
 import scipy.stats
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
-from puncture_twin.planning.registration.fits import KINDS, SIGNIFICANT, fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.registration import KINDS, SIGNIFICANT, register
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_4
 
 TARGET = np.array(TABLE_1["M"], float)

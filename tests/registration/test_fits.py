@@ -9,6 +9,7 @@ from uncertainty_world import declared, world
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
 from puncture_twin.planning.registration.fits import (
+    NoiseTest,
     ReadingNoise,
     design,
     differenced_map,
@@ -17,10 +18,10 @@ from puncture_twin.planning.registration.fits import (
     fit_triad,
     fit_weighted,
     least_squares_map,
+    noise_test,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
 T_TRUE = pose(exp_rotation(np.array([0.4, -0.2, 1.1])), np.array([300.0, -200.0, 100.0]))
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20]])

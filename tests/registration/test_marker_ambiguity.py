@@ -7,10 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration import method as marker_ambiguity
+from puncture_twin.planning.registration import marker_pairs as marker_ambiguity
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.method import HARMLESS_MM, renamings
+from puncture_twin.planning.registration.marker_pairs import HARMLESS_MM, MarkerPairs, renamings
 
 TARGET = np.array([10.0, -20.0, -90.0])
 NAMES = tuple("ABCDEFGHIJKL")

@@ -11,11 +11,10 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import apply, frame_about, pose
-from puncture_twin.planning.registration.fit_uncertainty import touching_configuration
 from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
+from puncture_twin.planning.registration.marker_noise import touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import conditioning, leverage
+from puncture_twin.planning.registration.registration import conditioning, leverage, register
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, radius_for_chance
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_4
 

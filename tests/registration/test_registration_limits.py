@@ -13,8 +13,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_affine, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
-from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import leverage
+from puncture_twin.planning.registration.registration import leverage, register
 
 TARGET = np.array([10.0, 20.0, 30.0])
 NAMES = ("a", "b", "c", "d")

@@ -7,16 +7,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose
-from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.method import rigid_rss
-from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import (
+from puncture_twin.planning.registration.fits import REJECT_LEVEL, fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs, rigid_rss
+from puncture_twin.planning.registration.registration import (
     FALSE_ALARM,
     MIN_FLE_MM,
-    REJECT_LEVEL,
     ResidualTest,
     outlier_marker,
+    register,
 )
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2
 

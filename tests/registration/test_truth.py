@@ -14,7 +14,7 @@ from puncture_twin.planning.case.tables import MarkerSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.residuals import leverage
+from puncture_twin.planning.registration.registration import leverage
 from puncture_twin.twin.plant.truth import draw_truth, registration_error
 
 MESHES = ROOT / "meshes"

@@ -19,8 +19,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.registration.fits import design, fit_rigid
-from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.method import renamings
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs, renamings
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.touch import marker_places
 from puncture_twin.planning.touch.marker_places import APART_MM, SLIP_MM, WINDOW_MM, propose_markers, tape_to

@@ -10,8 +10,8 @@ from scipy.linalg import null_space
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.settings import Stereo, Ultrasound
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty, reading_noise
-from puncture_twin.planning.registration.fits import fit_triad
+from puncture_twin.planning.registration.fits import fit_triad, fit_uncertainty
+from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.uncertainty.guided import WAYS, Follows, GuidedError, GuidedModel, Look, _root
 from puncture_twin.planning.uncertainty.hit import hit_in_ball

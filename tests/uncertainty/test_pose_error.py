@@ -10,10 +10,9 @@ from uncertainty_world import NO_ARM, SLICES, declared, world
 from puncture_twin.planning.arm.kinematics import FREE_D, N_PARAMETERS, error_jacobian, flange_pose
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise
+from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import leverage
+from puncture_twin.planning.registration.registration import leverage, register
 from puncture_twin.planning.uncertainty.pose_error import choose_touches, error_budget
 from puncture_twin.twin.plant.true_needle import joints_at_points, true_needle
 from puncture_twin.twin.rehearsal.trials import draw_trials

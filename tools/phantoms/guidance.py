@@ -12,7 +12,7 @@ from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise
+from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import PoseError, choose_touches

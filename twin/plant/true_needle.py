@@ -10,7 +10,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
-from puncture_twin.planning.registration.fit_uncertainty import parameter_variances
+from puncture_twin.planning.registration.marker_noise import parameter_variances
 from puncture_twin.planning.search.bending import Insertion
 from puncture_twin.planning.touch.tour_motions import Touch
 from puncture_twin.twin.world.client import to_m, to_mm

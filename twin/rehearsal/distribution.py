@@ -34,8 +34,8 @@ from puncture_twin.planning.case.tables import ControlScanSection
 from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import case_axis_lengths
-from puncture_twin.planning.registration.fit_uncertainty import touches
-from puncture_twin.planning.registration.residuals import INTERVAL
+from puncture_twin.planning.registration.fits import INTERVAL
+from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances

@@ -19,8 +19,8 @@ from puncture_twin.planning.breathing.breathing import Breathing, position_at
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.needle.insertion_force import Pushed
-from puncture_twin.planning.registration.fit_uncertainty import parameter_variances
 from puncture_twin.planning.registration.fits import (
+    Aim,
     ReadingNoise,
     design,
     fit_joint,
@@ -29,8 +29,8 @@ from puncture_twin.planning.registration.fits import (
     fit_weighted,
     least_squares_map,
 )
+from puncture_twin.planning.registration.marker_noise import parameter_variances
 from puncture_twin.planning.registration.placement import aimed_fit
-from puncture_twin.planning.registration.registration import Aim
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.plant.true_needle import TrueNeedle, joints_at_points, true_needle
 

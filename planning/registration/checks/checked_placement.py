@@ -21,8 +21,15 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import NO_RESIDUALS, MarkerSection, RegistrationSection, other_readings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.checks import places
-from puncture_twin.planning.registration.checks.markers import Surroundings, check_markers
+from puncture_twin.planning.registration.checks.markers import (
+    OF_MARKERS,
+    OF_MOUNT,
+    Surroundings,
+    base_place,
+    check_markers,
+    place_warnings,
+    up_base,
+)
 from puncture_twin.planning.registration.placement import Placement, load_placement, registered
 from puncture_twin.planning.registration.registration import Registration
 
@@ -107,8 +114,8 @@ def check_transform(
 
 
 def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Reading:
-    tilt = float(np.arccos(np.clip(places.up_base(case, T_base_ct)[2], -1.0, 1.0)))  # pi for an arm that hangs
-    return Reading(keys, T_base_ct, *places.base_place(case, skin, T_base_ct), tilt)
+    tilt = float(np.arccos(np.clip(up_base(case, T_base_ct)[2], -1.0, 1.0)))  # pi for an arm that hangs
+    return Reading(keys, T_base_ct, *base_place(case, skin, T_base_ct), tilt)
 
 
 def _better(others: Sequence[Reading]) -> str:
@@ -220,9 +227,9 @@ def placement_findings(
     skin = around.skin
     if placement.registration is not None:
         own = tuple(check_markers(case, around, placement.registration, cache))
-        return (*places.place_warnings(case, skin.mesh, placement.T_base_ct, places.OF_MARKERS, cache.memory), *own)
+        return (*place_warnings(case, skin.mesh, placement.T_base_ct, OF_MARKERS, cache.memory), *own)
     if case.robot.stated is None:
-        return tuple(places.place_warnings(case, skin.mesh, placement.T_base_ct, places.OF_MOUNT, cache.memory))
+        return tuple(place_warnings(case, skin.mesh, placement.T_base_ct, OF_MOUNT, cache.memory))
     registration = marker_registration(case, case.robot.stated)
     said = tuple(check_transform(case, skin.mesh, placement.T_base_ct, registration))
     if registration is None:

@@ -25,7 +25,7 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.needle.deflection import Bending, Shaft, Tissue
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touching_configuration
+from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.distribution import bend_along
 from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, plan_truth, spread_rows

@@ -14,7 +14,7 @@ from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.collision.state_checker import Contact, FirstContact
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
-from puncture_twin.planning.registration.residuals import leverage
+from puncture_twin.planning.registration.registration import leverage
 from puncture_twin.twin.guidance.stereo.camera_calibration import Points
 from puncture_twin.twin.guidance.stereo.servo_law import (
     MIN_SIGMA,

@@ -20,7 +20,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise
+from puncture_twin.planning.registration.marker_noise import reading_noise
 
 MOST_OFF_MM = 50.0
 """mm by which a stated tip may be wrong: more is another needle."""

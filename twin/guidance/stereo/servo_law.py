@@ -45,8 +45,7 @@ from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, frame_yz, log_rotation, pose, rotated_about
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residuals import Conditioning
+from puncture_twin.planning.registration.registration import Conditioning, register
 from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.guidance.stereo.camera_calibration import Points
 

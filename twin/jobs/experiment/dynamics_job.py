@@ -34,7 +34,7 @@ from puncture_twin.planning.motion.exciting import PERIOD_S, exciting_motion
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.motion.path_check import dense_states, first_contact
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
-from puncture_twin.planning.registration.registration import reached_insertion
+from puncture_twin.planning.registration.placement import reached_insertion
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.planning.uncertainty.sources import SOURCES

@@ -23,14 +23,12 @@ from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordina
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
-from puncture_twin.planning.registration.checks.places import touchable_points
-from puncture_twin.planning.registration.fits import ReadingNoise, rigid_fre_mm
+from puncture_twin.planning.registration.checks.markers import touchable_points
+from puncture_twin.planning.registration.fits import INTERVAL, LEAST_FOUND_MM, ReadingNoise, rigid_fre_mm
 from puncture_twin.planning.registration.hand_eye import HandEye, HandEyeNoise, noise_of
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
-from puncture_twin.planning.registration.method import LEAST_FOUND_MM
 from puncture_twin.planning.registration.placement import odd_branches, one_more, without_each
 from puncture_twin.planning.registration.registration import Registration, register
-from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts

@@ -14,9 +14,9 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-from puncture_twin.planning.registration.placement import default_method
-from puncture_twin.planning.registration.registration import Registration, reached_insertion, register
-from puncture_twin.planning.registration.residuals import INTERVAL
+from puncture_twin.planning.registration.fits import INTERVAL
+from puncture_twin.planning.registration.placement import default_method, reached_insertion
+from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm, pose_error
 from puncture_twin.planning.uncertainty.sources import SOURCES, not_modelled

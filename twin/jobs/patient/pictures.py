@@ -17,7 +17,7 @@ from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.registration.checks.places import touchable_points
+from puncture_twin.planning.registration.checks.markers import touchable_points
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation

@@ -1,11 +1,6 @@
-"""Covariance of a registration, from its method and the declared errors of its markers.
-
-The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
-"""
+"""The declared noise of a case's markers, with the arm's configuration at each touch: as recorded, or likely."""
 
 import contextlib
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,74 +15,6 @@ from puncture_twin.planning.case.errors import ArmUncertainty, ErrorModel
 from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.registration import fits
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
-from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
-
-
-@dataclass(frozen=True, eq=False)
-class FitUncertainty:
-    """The declared errors of the markers, and the map from them to the pose; base axes, mm and rad."""
-
-    noise: fits.ReadingNoise
-    R_base_ct: Floats  # shape (3, 3), as registered
-    center_base: Floats  # shape (3,), the markers' centroid, about which `fit_map` turns
-    fit_map: Floats  # L, shape (6, 3 N), from the stacked reading errors to shift and rotation
-    test: NoiseTest
-    """Whether the residuals agree with the declaration; its scale is not yet in the covariances below."""
-
-    @property
-    def fle_mm(self) -> float:
-        """The rms length of one marker's error, CT and touch together, scaled; the arm's own errors not counted."""
-        omega = self.noise.covariance(self.R_base_ct).independent
-        return self.test.scale * float(np.sqrt(np.trace(omega) / (len(omega) / 3)))
-
-    def map_at(self, point_base: Floats) -> Floats:
-        """X L, shape (6, 3 N): shift at a point (3,) and rotation, per reading error."""
-        return fits.carried(self.center_base, point_base) @ self.fit_map
-
-    def cov_at(self, point_base: Floats) -> Floats:
-        """X L Omega L' X', shape (6, 6): shift (mm) at a point (3,) and rotation, from the readings alone, scaled."""
-        at = self.map_at(point_base)
-        return np.asarray(self.test.scale**2 * at @ self.noise.covariance(self.R_base_ct).independent @ at.T)
-
-    def parts_at(self, point_base: Floats) -> tuple[Floats, Floats]:
-        """`cov_at`'s part of shift, shape (3, 3) each: of the reading in the CT, and of the touch."""
-        marks = self.map_at(point_base)[:3].reshape(3, -1, 3)
-        read = self.R_base_ct @ self.noise.cov_ct @ self.R_base_ct.T
-        of_ct, of_touch = (
-            self.test.scale**2
-            * np.einsum("anb,nbc,dnc->ad", marks, np.broadcast_to(block, self.noise.cov_base.shape), marks)
-            for block in (read, self.noise.cov_base)
-        )
-        return of_ct, of_touch
-
-
-def fit_uncertainty(
-    method: str,
-    fit: Callable[[Floats, Floats], Floats],
-    T_base_ct: Floats,
-    points_ct: Floats,
-    points_base: Floats,
-    noise: fits.ReadingNoise,
-    *,
-    found: bool,
-) -> FitUncertainty:
-    """The uncertainty of a pose (4, 4) that a method's fit gave of points (N, 3) in both frames, mm.
-
-    ``rigid``, ``weighted`` and ``joint`` have a formula; of others ``fit`` is differenced. ``found``: the residuals
-    give the errors' size.
-    """
-    R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
-    fitted = points_ct @ R.T + T_base_ct[:3, 3]
-    A, covariance = fits.design(fitted, center), noise.covariance(R)
-    if method in {"weighted", "joint"}:
-        cov = covariance.independent if method == "weighted" else covariance.whole
-        L = fits.least_squares_map(A, np.asarray(np.linalg.inv(cov), dtype=np.float64))
-    elif method == "rigid":
-        L = fits.least_squares_map(A)
-    else:
-        L = fits.differenced_map(fit, points_ct, fitted)
-    test = noise_test((points_base - fitted).ravel(), covariance.whole, A, found=found)
-    return FitUncertainty(noise, R, center, L, test)
 
 
 def parameter_variances(arm: ArmUncertainty) -> Floats:
