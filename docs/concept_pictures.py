@@ -21,7 +21,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.tables import AIR_HU
-from puncture_twin.planning.collision.spheres import sphere_tree
+from puncture_twin.planning.collision.packed import sphere_tree
 from puncture_twin.planning.evidence.edges import Placement, compare, edge_image, sample_surfaces
 from puncture_twin.planning.evidence.label_placement import REFUSING_Z
 from puncture_twin.planning.geometry.rigid import pose

@@ -1,16 +1,17 @@
-"""Bodies of the arm and the patient for FCL: links and tool as convex pieces, bare and padded; the skin in parts.
+"""Bodies of the arm and the patient for FCL, and what checkers return: contacts and distances between them.
 
-`arm_bodies` makes all of them; a `Solid` is built by FCL when it is first queried, and so is each part of an `FclSkin`.
-A `Check` is one query to FCL. Where surfaces do not touch, `LooseParts` tells whether a part of one lies within a
-convex piece.
+Links and tool are convex pieces, bare and padded; the skin is in parts. `arm_bodies` makes all of them; a `Solid` is
+built by FCL when it is first queried, and so is each part of an `FclSkin`. A `Check` is one query to FCL. Where
+surfaces do not touch, `LooseParts` tells whether a part of one lies within a convex piece.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations, islice, pairwise, product
+from types import MappingProxyType
 from typing import NamedTuple
 
 import fcl
@@ -27,11 +28,60 @@ from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.collision.kernels.surfaces import boxes_near, points_within
-from puncture_twin.planning.collision.spheres import prism
-from puncture_twin.planning.collision.state_checker import PATIENT, Contact
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined, packed_meshes, unpacked_meshes
 from puncture_twin.planning.geometry.rigid import pose
+
+PATIENT = "patient"
+BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
+"""The bodies of the arm, from the base on; not every arm has a tool."""
+
+
+class Contact(NamedTuple):
+    """Two bodies that touch, such as ``("forearm", "patient")``; a body of the arm first."""
+
+    body: str
+    other: str
+
+
+NEEDLE_IN_PATIENT = Contact("needle", PATIENT)
+"""What may happen while the needle goes in."""
+
+
+class FirstContact(NamedTuple):
+    """The first contact along a path: at which of its states, and of what."""
+
+    at: int  # index of the state
+    contact: Contact
+
+
+class Nearest(NamedTuple):
+    """The smallest distance between the arm and something else; infinite, with empty names, where there is nothing."""
+
+    mm: float
+    body: str
+    other: str
+
+
+class Distances(NamedTuple):
+    """Least distances of the arm, mm, 0 where it touches."""
+
+    patient: Nearest  # moving links and holder to the skin
+    needle: Nearest  # needle to the skin: 0 while it goes in
+    boxes: Nearest  # moving links, holder and needle to the workcell's boxes
+
+
+DISTANCE_PAIRS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"patient": BODY_NAMES[1:-1], "needle": BODY_NAMES[-1:], "boxes": BODY_NAMES[1:]}
+)
+"""The kinds of distance, by the fields of ``Distances``, and the bodies that each is measured from."""
+
+
+def require_finite(q: Floats) -> None:
+    """Refuse joint angles that are not finite: FCL would call them free."""
+    if not np.isfinite(q).all():
+        refuse(f"joint angles {q} are not finite", "collision check", "six angles in rad", "not_finite")
+
 
 FLANGE_FRAME = 6
 """The frame of wrist 3, whose origin and axes are the flange's."""
@@ -41,6 +91,25 @@ joined is tested."""
 NEVER_TOUCHING = frozenset({("wrist_2", "holder"), ("wrist_2", "needle")})
 """Pairs that cannot touch where the arm ships with the program: holder and needle begin at the flange, beyond wrist 2,
 and point away at every angle; wrist 2 of an own arm may carry a bracket."""
+
+
+PRISM_SIDES = 24
+"""Sides of the prism about a cylinder: 0.9 % fuller than it."""
+FINE_SIDES = 96
+"""Sides of the prism about a cylinder that is tested against triangles: 0.05 % fuller than it."""
+
+
+def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
+    """Corners of a prism about a cylinder along z, centred: shape (2 ``sides``, 3), mm; those of one end first."""
+    turn = 2.0 * np.pi * np.arange(sides) / sides
+    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)  # circumscribed: encloses the circle
+    ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    half = length_mm / 2.0 + SLACK_MM
+    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
+
+
+SLACK_MM = 1e-6
+"""Every sphere is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
 
 
 class Shape(NamedTuple):

@@ -17,20 +17,19 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.collision.bodies import Check
-from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.bodies import (
+    NEEDLE_IN_PATIENT,
+    PATIENT,
+    Check,
+    Contact,
+    FirstContact,
+    require_finite,
+)
+from puncture_twin.planning.collision.checker import CellChecker, SweptBodies
 from puncture_twin.planning.collision.kernels import segments
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.packed import ROUND
 from puncture_twin.planning.collision.proofs import Motion, Proofs, without_neighbours
-from puncture_twin.planning.collision.state_checker import (
-    NEEDLE_IN_PATIENT,
-    PATIENT,
-    Contact,
-    FirstContact,
-    SweptBodies,
-    require_finite,
-)
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 

@@ -22,13 +22,13 @@ from puncture_twin.planning.collision.packed import (
     ROUND,
     WORKCELL_FRAME,
     PackedHulls,
+    finer_prism,
     joint_levers,
     made_from,
     packed_movers,
     packed_skin,
     packed_trees,
 )
-from puncture_twin.planning.collision.spheres import finer_prism
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.bodies import Contact
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
-from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.motion import shortest
 from puncture_twin.planning.motion.follow import follow, rounded
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact

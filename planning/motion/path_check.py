@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.collision.bodies import DISTANCE_PAIRS, Contact, Distances, Nearest
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.state_checker import DISTANCE_PAIRS, Contact, Distances, Nearest
 
 RESOLUTION_RAD = 0.05
 """Joint distance of the states at which FCL alone checks a segment: up to 50 mm at a metre, never the last word."""

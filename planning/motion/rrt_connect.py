@@ -23,7 +23,7 @@ from ompl import base as ob, geometric as og, util as ou
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.state_checker import Contact
+from puncture_twin.planning.collision.bodies import Contact
 
 RANGE_RAD = 1.0
 """Longest branch of the planner's trees, with the wrist's joints counted for half."""

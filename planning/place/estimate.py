@@ -24,7 +24,8 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.collision.spheres import prism, sphere_tree
+from puncture_twin.planning.collision.bodies import prism
+from puncture_twin.planning.collision.packed import sphere_tree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import Site, WantedDirections
 

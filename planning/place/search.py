@@ -38,10 +38,9 @@ from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.collision import workcell
-from puncture_twin.planning.collision.bodies import FclSkin, Solid, connected_parts
+from puncture_twin.planning.collision.bodies import PATIENT, FclSkin, Solid, connected_parts
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.place.estimate import Boxes, Estimator, ReachEstimate, SkinField, Surroundings

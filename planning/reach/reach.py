@@ -22,8 +22,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.collision.bodies import BODY_NAMES, Contact
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.state_checker import BODY_NAMES, Contact
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.reach.survey import (
     MARGIN_DIGITS,

@@ -17,7 +17,7 @@ from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, l
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
-from puncture_twin.planning.collision.state_checker import SweptBodies, motion_bounds
+from puncture_twin.planning.collision.checker import SweptBodies, motion_bounds
 
 
 @dataclass(frozen=True, eq=False)

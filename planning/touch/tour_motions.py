@@ -23,8 +23,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.collision.bodies import NEEDLE_IN_PATIENT
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.state_checker import NEEDLE_IN_PATIENT
 from puncture_twin.planning.collision.workcell import case_checker, home_configuration
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.motion.approach import plan_approach

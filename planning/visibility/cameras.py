@@ -20,8 +20,8 @@ from puncture_twin.planning.base.arrays import Bools, Floats, read_only
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.text import Facts, Shown, brief, first_few, plural
 from puncture_twin.planning.case.case import bed_frame
-from puncture_twin.planning.collision.bodies import Body, FclSkin, Solid, arm_bodies, touch
-from puncture_twin.planning.collision.state_checker import PATIENT, SweptBodies
+from puncture_twin.planning.collision.bodies import PATIENT, Body, FclSkin, Solid, arm_bodies, touch
+from puncture_twin.planning.collision.checker import SweptBodies
 from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, inverse

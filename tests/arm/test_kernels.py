@@ -14,7 +14,7 @@ from puncture_twin.planning.arm.inverse_kinematics import (
 from puncture_twin.planning.arm.kinematics import flange_pose, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
-from puncture_twin.planning.collision.state_checker import SweptBodies
+from puncture_twin.planning.collision.checker import SweptBodies
 from puncture_twin.planning.reach.survey import ReachRequest, every_branch, fill_branch_path, surveyed
 
 DEPTHS = np.linspace(0.0, 120.0, 61)

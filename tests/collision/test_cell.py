@@ -16,8 +16,10 @@ from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual
 from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM, Box, Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.bodies import (
+    BODY_NAMES,
     NEVER_TESTED,
     PART_TRIANGLES,
+    Contact,
     FclSkin,
     LooseParts,
     Solid,
@@ -26,9 +28,8 @@ from puncture_twin.planning.collision.bodies import (
     surface,
     touch,
 )
-from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.checker import CellChecker, SweptBodies
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.state_checker import BODY_NAMES, Contact, SweptBodies
 from puncture_twin.planning.geometry.containment import winding_number, winding_numbers
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose

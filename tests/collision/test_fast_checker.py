@@ -18,14 +18,21 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.collision.bodies import arm_bodies, convex, surface
+from puncture_twin.planning.collision.bodies import FINE_SIDES, arm_bodies, convex, prism, surface
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.proofs import SKIN
 from puncture_twin.planning.collision.kernels.surfaces import ROUGH, STACK, skin_gap, to_surface
-from puncture_twin.planning.collision.packed import TriangleTree, coarse_hull, inscribed_prism, neighbours
-from puncture_twin.planning.collision.spheres import FINE_SIDES, finer_prism, halves, prism, sphere_tree
+from puncture_twin.planning.collision.packed import (
+    TriangleTree,
+    coarse_hull,
+    finer_prism,
+    halves,
+    inscribed_prism,
+    neighbours,
+    sphere_tree,
+)
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose

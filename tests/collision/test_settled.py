@@ -12,13 +12,12 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
-from puncture_twin.planning.collision.bodies import surface, touch
+from puncture_twin.planning.collision.bodies import BODY_NAMES, surface, touch
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import deep
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES, TOUCHES_OUTSIDE, on_skin, settled_at
 from puncture_twin.planning.collision.packed import packed_skin
-from puncture_twin.planning.collision.state_checker import BODY_NAMES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 

@@ -21,9 +21,9 @@ from puncture_twin.planning.arm.kinematics import (
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.bodies import Contact
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.motion.approach import Approach, plan_approach
 from puncture_twin.planning.motion.follow import (

@@ -17,9 +17,8 @@ from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.checker import CellChecker, SweptBodies
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.state_checker import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.reach.reach import assess_reach_all, missing_reach_mm
 from puncture_twin.planning.reach.survey import MAX_SWEEP_MM, ReachRequest, every_branch, fill_branch_path, sampled

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.state_checker import PATIENT
+from puncture_twin.planning.collision.bodies import PATIENT
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import Arm, load_arm
 from puncture_twin.twin.world.client import physics_client, pose_to_m, pybullet, to_m, write_obj

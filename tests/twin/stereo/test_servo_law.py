@@ -11,7 +11,7 @@ from servo_world import CASE, HELD, NoContacts, start_configurations
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.errors import ArmErrors
-from puncture_twin.planning.collision.state_checker import Contact, FirstContact
+from puncture_twin.planning.collision.bodies import Contact, FirstContact
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.registration import leverage

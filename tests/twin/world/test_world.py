@@ -13,7 +13,7 @@ from refusals import refused
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.collision.state_checker import BODY_NAMES
+from puncture_twin.planning.collision.bodies import BODY_NAMES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.client import (

@@ -39,8 +39,8 @@ from puncture_twin.planning.arm.kinematics import (
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.bodies import Contact
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, frame_yz, log_rotation, pose, rotated_about
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
