@@ -13,7 +13,7 @@ from puncture_twin.planning.base.cache.array_cache import NO_MEMORY
 from puncture_twin.planning.batch.cohort import CohortCase
 from puncture_twin.planning.batch.plan import planned, read_plan_table
 from puncture_twin.planning.batch.run_case import CaseTask, run_case
-from puncture_twin.planning.case.options import case_options
+from puncture_twin.planning.case.case_file import case_options
 from puncture_twin.run_twin import main
 
 SEARCH = "theta_deg = [0, 60]\nbeta_deg = [0, 270]\nstep_deg = 30.0"

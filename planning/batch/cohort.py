@@ -20,7 +20,7 @@ from puncture_twin.planning.base.files import decode_text, is_folder, read_input
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
-from puncture_twin.planning.case.options import NO_OPTIONS, SECTIONS, CaseOptions, case_options
+from puncture_twin.planning.case.case_file import NO_OPTIONS, SECTIONS, CaseOptions, case_options
 from puncture_twin.planning.case.tables import Section, Text
 
 CASE_FILE = "case.toml"

@@ -33,7 +33,7 @@ from puncture_twin.planning.base.strict_json import read_json
 from puncture_twin.planning.base.toml_file import find_toml, read_toml_bytes
 from puncture_twin.planning.batch.cohort import CohortCase
 from puncture_twin.planning.case.case import ALLOWED_CASE, load_case
-from puncture_twin.planning.case.options import case_options
+from puncture_twin.planning.case.case_file import case_options
 
 PLAN_NAME, MAX_PLAN_BYTES, ID_DIGITS = "plan.parquet", 2_000_000_000, 32
 """Hexadecimal digits of an id: 128 bits, and too many digits for a number in any reader of partitions."""

@@ -29,7 +29,7 @@ from puncture_twin.planning.base.provenance import Input, inputs_document, read_
 from puncture_twin.planning.batch import plan as plans
 from puncture_twin.planning.batch.merge import blank_row, searched_row
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.case.options import case_options
+from puncture_twin.planning.case.case_file import case_options
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.table import write_table

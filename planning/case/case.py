@@ -19,10 +19,9 @@ from puncture_twin.planning.base.text import Facts, Shown, brief, did_you_mean
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case import named_files, settings, tables
-from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.case_file import NO_OPTIONS, OPTIONS_ROLE, CaseFile, CaseOptions, case_options
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid, lps_axis
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
-from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.labels.label_sources import structure_name
 from puncture_twin.planning.formats.points import parse_points
@@ -213,7 +212,7 @@ def case_of(
     space = Space(content.space)
     target = _target_of(content, path, space, files)
     robot = settings.robot_of(content, space, path, files)
-    tool = tables.tool_of(content.tool, files, path)
+    tool = settings.tool_of(content.tool, files, path)
     searched, placed, motion = content.search, content.registration, None
     if content.motion is not None:  # a diagonal covariance: LPS and RAS are the same
         motion = settings.Motion(read_only(np.diag(np.square(content.motion.target_sd_mm))))
@@ -243,7 +242,7 @@ def case_of(
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=(*warnings, *named_files.robot_warnings(content, robot)),
+        warnings=(*warnings, *settings.robot_warnings(content, robot)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=errors_of(content, content.errors, case_volumes, path),
         truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),

@@ -15,7 +15,6 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import unfinished_warnings
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.settings import RobotSettings
 from puncture_twin.planning.case.tables import StructuresSection
 from puncture_twin.planning.formats import itk_transform, points
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file, is_series
@@ -202,10 +201,6 @@ TOP_COUNT_NOTE = (
     "[end], the file's last table"
 )
 NOT_LAST_NOTE = "[end] is not the last table of the case: a cut after it would go unnoticed"
-ROBOT_NOWHERE = (
-    "the case states a robot ({robot}) but not the position of its base: the arm is not checked ([registration] or "
-    "[robot.mount] places it)"
-)
 _HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([^\[\]\n]+?)[ \t]*\]{1,2}[ \t]*(?:#.*)?$", re.MULTILINE)
 """The header of a table, on a line of its own."""
 LINE_FILES = (".csv", ".fcsv")
@@ -221,10 +216,3 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
         return (TOP_COUNT_NOTE,)
     headers = _HEADER.findall(files.content(path.name).decode("utf-8"))
     return () if headers and headers[-1] == "end" else (NOT_LAST_NOTE,)
-
-
-def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
-    """Warning of a case that does not say where a robot is: no verdict includes one."""
-    located = content.registration is not None or content.robot.mount is not None
-    nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
-    return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()

@@ -12,9 +12,11 @@ from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
 import numpy as np
+import scipy
 
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.links import own_arm
+from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.arm.urdf.document import MOST_BYTES
 from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, JointLimits, StatedLimits, narrowed
@@ -25,12 +27,12 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case import tables
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import AXES_PARALLEL, entry_frame, lps_axis
-from puncture_twin.planning.case.tables import Anatomical
+from puncture_twin.planning.case.tables import TOOL_ROLE, Anatomical
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.labels.naming import REST, ByName
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.geometry.rigid import frame_of_axes, pose
-from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.spaces import Space, parse_unit, to_lps
 from puncture_twin.planning.needle.deflection import GAUGES, STEEL_GPA, Bending, Shaft, Tissue
 
 
@@ -325,6 +327,34 @@ def stated_limits(section: tables.LimitsSection | None) -> StatedLimits:
     if section.lowest_deg is not None:
         angles = np.radians(np.stack([section.lowest_deg, section.highest_deg or ()], axis=1))
     return StatedLimits(angles, None if section.max_speed_deg_s is None else np.radians(section.max_speed_deg_s))
+
+
+def tool_of(section: tables.ToolSection | None, files: InputFiles, path: Path) -> ToolBody | None:
+    """The tool's body, turned about the flange's x, y and z, in this order, then moved; its file becomes an input.
+
+    Raises InputError: a file that cannot be used, or a unit that is not known.
+    """
+    if section is None:
+        return None
+    unit, file = parse_unit(section.unit, where=f"{path}: tool.unit"), path.parent / section.mesh
+    data = files.read(TOOL_ROLE, section.mesh, max_bytes=meshes.MAX_FILE_BYTES, key="tool.mesh", where=path)
+    turn = scipy.spatial.transform.Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
+    T = pose(turn, np.array(section.position_mm))
+    mesh = meshes.parse_mesh(data, file, unit=unit, space=Space.LOCAL, up=section.up).transformed(T)
+    return ToolBody(mesh, file, unit.mm, T, f"{path}: tool")
+
+
+ROBOT_NOWHERE = (
+    "the case states a robot ({robot}) but not the position of its base: the arm is not checked ([registration] or "
+    "[robot.mount] places it)"
+)
+
+
+def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
+    """Warning of a case that does not say where a robot is: no verdict includes one."""
+    located = content.registration is not None or content.robot.mount is not None
+    nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
+    return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()
 
 
 SAME_MM = 0.03

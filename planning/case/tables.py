@@ -8,24 +8,19 @@ import re
 import unicodedata
 from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import scipy
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, StringConstraints, model_validator
 
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS as USUAL, HIGHEST
-from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import SchemaError
-from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.base.text import MAX_NAME
-from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.points import plainly_radians
 from puncture_twin.planning.geometry.rigid import inverse, pose
-from puncture_twin.planning.geometry.spaces import Space, Up, parse_unit
+from puncture_twin.planning.geometry.spaces import Up
 
 
 def _plain_name(value: str) -> str:
@@ -650,18 +645,3 @@ class ToolSection(Section):
     up: Up | None = None
     position_mm: tuple[Beside, Beside, Beside] = (0.0, 0.0, 0.0)
     rotation_deg: tuple[ToolTurn, ToolTurn, ToolTurn] = (0.0, 0.0, 0.0)
-
-
-def tool_of(section: ToolSection | None, files: InputFiles, path: Path) -> ToolBody | None:
-    """The tool's body, turned about the flange's x, y and z, in this order, then moved; its file becomes an input.
-
-    Raises InputError: a file that cannot be used, or a unit that is not known.
-    """
-    if section is None:
-        return None
-    unit, file = parse_unit(section.unit, where=f"{path}: tool.unit"), path.parent / section.mesh
-    data = files.read(TOOL_ROLE, section.mesh, max_bytes=meshes.MAX_FILE_BYTES, key="tool.mesh", where=path)
-    turn = scipy.spatial.transform.Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
-    T = pose(turn, np.array(section.position_mm))
-    mesh = meshes.parse_mesh(data, file, unit=unit, space=Space.LOCAL, up=section.up).transformed(T)
-    return ToolBody(mesh, file, unit.mm, T, f"{path}: tool")

@@ -20,9 +20,10 @@ from puncture_twin.planning.evidence import target
 from puncture_twin.planning.evidence.inside_skin import odd_units, outside_skin, overlaps
 from puncture_twin.planning.evidence.label_placement import label_placement
 from puncture_twin.planning.evidence.named_places import densities, order_of_organs
-from puncture_twin.planning.registration.checks.checked_placement import placement_findings, weak_points
+from puncture_twin.planning.registration.checks.checked_placement import placement_findings
 from puncture_twin.planning.registration.checks.markers import Surroundings
 from puncture_twin.planning.registration.placement import Placement
+from puncture_twin.planning.registration.registration import weak_points
 
 STEP_SLACK = 1e-9
 """Steps by which a range may miss a whole number of them: rounding of radians."""

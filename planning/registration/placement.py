@@ -49,7 +49,7 @@ from puncture_twin.planning.registration.fits import (
     noise_test,
 )
 from puncture_twin.planning.registration.marker_noise import marker_noise
-from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, check_pairs, match
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, match
 from puncture_twin.planning.registration.registration import Registration, register
 
 MAX_AIM_OFF_MM = 20.0
@@ -87,7 +87,6 @@ def registered(case: Case, settings: MarkerSection) -> Registration:
     method = "joint" if settings.correct else settings.method or default_method(errors)
     in_ct, in_base = _points(case, settings.markers_ct, case.space), _points(case, settings.markers_base, Space.LOCAL)
     markers = match(in_ct, in_base, use=settings.use, where=where)
-    check_pairs(markers, where)
     return register(
         markers,
         method=method,

@@ -15,7 +15,8 @@ misread can look the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -613,3 +614,9 @@ def register(
     # 4. Whether the markers suit the target: spread, leverage.
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, target_ct, uncertainty)
+
+
+def weak_points(registration: Registration) -> Iterator[Finding]:
+    """The flags of a registration, each naming it: they stand among findings of other things."""
+    for flag in registration.flags:
+        yield replace(flag, sentence=f"registration: {flag.sentence}")

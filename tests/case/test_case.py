@@ -14,9 +14,8 @@ from refusals import refused
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.case.case_file import case_schema
+from puncture_twin.planning.case.case_file import case_options, case_schema
 from puncture_twin.planning.case.errors import Cells, error_model
-from puncture_twin.planning.case.options import case_options
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import ErrorsSection, MountSection
 from puncture_twin.planning.geometry.spaces import Space

@@ -11,7 +11,7 @@ from refusals import refused
 
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.case import load_case
-from puncture_twin.planning.case.options import case_options
+from puncture_twin.planning.case.case_file import case_options
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.plan.plan_check import arm_document, read_arm, same_arm
 

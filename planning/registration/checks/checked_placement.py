@@ -8,7 +8,7 @@ readings of its keys.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +31,7 @@ from puncture_twin.planning.registration.checks.markers import (
     up_base,
 )
 from puncture_twin.planning.registration.placement import Placement, load_placement, registered
-from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.registration import Registration, weak_points
 
 UPRIGHT = np.radians(30.0)
 """Angle of the base's z axis from up up to which an arm is upright: on a floor, a rail or a cart, as most are."""
@@ -235,9 +235,3 @@ def placement_findings(
     if registration is None:
         return said
     return (*said, *weak_points(registration), *check_markers(case, around, registration, cache))
-
-
-def weak_points(registration: Registration) -> Iterator[Finding]:
-    """The flags of a registration, each naming it: they stand among findings of other things."""
-    for flag in registration.flags:
-        yield replace(flag, sentence=f"registration: {flag.sentence}")
