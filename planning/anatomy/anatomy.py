@@ -311,8 +311,8 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
     of_meshes = cached_mesh_warnings(read, cache)
     warnings = (*loader.warnings, *ending, *left_out, *skin.warnings, *of_meshes)
-    found = (*guesses, *unseen.findings)
-    return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch, found)
+    findings = (*guesses, *unseen.findings)
+    return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch, findings)
 
 
 def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Finding:

@@ -45,14 +45,14 @@ class DefaultRole(NamedTuple):
 
 def _table(text: str) -> tuple[DefaultRole, ...]:
     """Lines of the table: kind, margin, group and reason; below, indented, the patterns."""
-    found = []
+    lines = []
     for row in re.split(r"\n(?=\S)", text.strip()):
         first, _, patterns = row.partition("\n")
         start, _, reason = first.partition(": ")
         what, _, group = start.partition(", ")
         kind, _, margin_mm = what.partition(" ")
-        found.append(DefaultRole(group, tuple(patterns.split()), KINDS[kind], float(margin_mm), reason))
-    return tuple(found)
+        lines.append(DefaultRole(group, tuple(patterns.split()), KINDS[kind], float(margin_mm), reason))
+    return tuple(lines)
 
 
 UNKNOWN_NAME, BODY, NOT_ANNOTATED, LESION = _table("""
@@ -192,8 +192,8 @@ def default_role(name: str, region: str) -> DefaultRole | None:
     plain = plain_name(name)
     own, general = (list(_matching(plain, lines)) for lines in (BY_REGION.get(region, ()), GENERAL))
     lesion = list(_matching(plain.replace(LATERAL_MASS, ""), (LESION,)))
-    found = lesion or own or general
-    closest = max(found, key=lambda one: one[0], default=(0.0, None))[1]
+    matches = lesion or own or general
+    closest = max(matches, key=lambda one: one[0], default=(0.0, None))[1]
     if closest is None or closest.kind in ("avoid", "unknown"):
         return closest
     hurt = [one for one in general if one[1].kind == "avoid" and one[1].group != closest.group]

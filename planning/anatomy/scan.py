@@ -206,8 +206,8 @@ def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
 
 
 def _bulky(mask: Bools, spacing_mm: Floats) -> Bools:
-    found = parts_of(mask, corners=True)
-    return found.painted(found.sizes * np.prod(spacing_mm) >= 1000.0 * BULKY_ML)
+    pieces = parts_of(mask, corners=True)
+    return pieces.painted(pieces.sizes * np.prod(spacing_mm) >= 1000.0 * BULKY_ML)
 
 
 GAS_HU = -300.0
@@ -251,9 +251,9 @@ def _surface(mask: Bools, ct: CtImage) -> TriangleMesh | None:
     if not mask.any():
         return None
     box = box_in(mask)
-    found = parts_of(mask[box], corners=True)
-    large = found.sizes >= MIN_COMPONENT_MM3 / float(np.prod(ct.spacing_mm))
-    mask[box] = found.painted(large)
+    components = parts_of(mask[box], corners=True)
+    large = components.sizes >= MIN_COMPONENT_MM3 / float(np.prod(ct.spacing_mm))
+    mask[box] = components.painted(large)
     return mask_surface(mask, ct.T_ct_index, where=ct.where) if large.any() else None
 
 
@@ -462,14 +462,14 @@ def nearest(values: NDArray[np.float32], T_index_ct: Floats, points_ct: Floats) 
 @nb.njit(cache=True, error_model="numpy")
 def _nearest(values: Any, T: Any, points: Any) -> Any:
     """As `nearest`, of values that lie in memory as they are numbered. The order of a sum decides half-way points."""
-    found = np.empty(len(points))
+    values_at = np.empty(len(points))
     for n in range(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         i = np.rint(T[0, 0] * x + T[0, 2] * z + T[0, 1] * y + T[0, 3])
         j = np.rint(T[1, 0] * x + T[1, 2] * z + T[1, 1] * y + T[1, 3])
         k = np.rint(T[2, 0] * x + T[2, 2] * z + T[2, 1] * y + T[2, 3])
         if 0 <= i < values.shape[0] and 0 <= j < values.shape[1] and 0 <= k < values.shape[2]:
-            found[n] = values[int(i), int(j), int(k)]
+            values_at[n] = values[int(i), int(j), int(k)]
         else:
-            found[n] = np.nan
-    return found
+            values_at[n] = np.nan
+    return values_at

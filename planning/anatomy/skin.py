@@ -130,17 +130,17 @@ def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
     return tuple(ends)
 
 
-def _skin(mesh: TriangleMesh, found: BodyMask, T_ct_index: Floats) -> Skin:
-    view, centres = field_of_view(found.body, T_ct_index), mesh.triangles.mean(axis=1)
+def _skin(mesh: TriangleMesh, body: BodyMask, T_ct_index: Floats) -> Skin:
+    view, centres = field_of_view(body.body, T_ct_index), mesh.triangles.mean(axis=1)
     low = view.to_box(centres)
     from_faces = np.stack([low, view.size_mm - low], axis=2)  # the cap and its chamfer lie within half a voxel
     cut = np.any((from_faces < 0.5 * spacing_of(T_ct_index)[:, None]) & view.cut, axis=(1, 2))
-    if found.unscanned.any():  # and triangles in whose cell of eight voxels one was not scanned
+    if body.unscanned.any():  # and triangles in whose cell of eight voxels one was not scanned
         index = np.floor(np.linalg.solve(T_ct_index[:3, :3], (centres - T_ct_index[:3, 3]).T).T).astype(int)
         for step in itertools.product((0, 1), repeat=3):
-            cell = tuple(np.clip(index + step, 0, np.array(found.body.shape) - 1).T)
-            cut |= found.unscanned[cell] & ~found.body[cell]
-    return Skin(mesh, cut, view, found.warnings)
+            cell = tuple(np.clip(index + step, 0, np.array(body.body.shape) - 1).T)
+            cut |= body.unscanned[cell] & ~body.body[cell]
+    return Skin(mesh, cut, view, body.warnings)
 
 
 def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
@@ -167,14 +167,14 @@ class SkinPaths:
 
 def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: float) -> SkinPaths:
     """Follow every path from the target (3,) outward along unit vectors (n, 3), as far as the flange can be, mm."""
-    found, consistent = consistent_crossings(skin.mesh, target_ct, outward_ct)
-    has = found.count > 0
-    first = found.first[has]
+    crossed, consistent = consistent_crossings(skin.mesh, target_ct, outward_ct)
+    has = crossed.count > 0
+    first = crossed.first[has]
     depth, face = np.full(len(outward_ct), np.nan), np.zeros(len(outward_ct), np.int64)
-    depth[has], face[has] = found.depth[first], found.face[first]
-    again = found.count > 1
+    depth[has], face[has] = crossed.depth[first], crossed.face[first]
+    again = crossed.count > 1
     reentry = np.full(len(outward_ct), np.nan)
-    reentry[again] = found.depth[found.first[again] + 1]
+    reentry[again] = crossed.depth[crossed.first[again] + 1]
     reentry[reentry > farthest] = np.nan
     cut = has & skin.cut_faces[face]
     unknown = np.where(cut, depth, np.nan)

@@ -142,13 +142,13 @@ class VolumeSurfaces:
 
         content, organs = self._kept(f"content {label}", measured, _to_content), tuple(organs)
 
-        def found() -> Bools:
+        def cut_sides() -> Bools:
             return cut_ends.cut_ends(content, organs, whole=shown.phantom)
 
         by = ((mesh.digest, voxel_mm) for mesh, voxel_mm in organs)
         key = (*self._key(f"ends {label}"), shown.phantom, *by)
         if stated is None:
-            cut = self.cache.memory.get(key, found, lambda sides: sides.nbytes)
+            cut = self.cache.memory.get(key, cut_sides, lambda sides: sides.nbytes)
         else:
             cut = cut_ends.stated_ends(stated)
         notes = cut_ends.end_warnings(content, cut, shown.phantom and stated is None)
@@ -213,8 +213,8 @@ class Imaged:
                 return _of_skin(skin_of_image(self.image))
             return _of_skin(skin_from_label(self.surfaces.labelmap, self.label, self.box))
 
-        kept = self.kept({"what": "skin", "label": self.label}, make, _to_skin, by=__name__)
-        return replace(kept, warnings=(*self.notes, *kept.warnings))
+        skin = self.kept({"what": "skin", "label": self.label}, make, _to_skin, by=__name__)
+        return replace(skin, warnings=(*self.notes, *skin.warnings))
 
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str

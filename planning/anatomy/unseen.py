@@ -89,18 +89,18 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO
     ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
     if not ends:
         return Beyond((), ())
-    found = [assumed(case, view, skin, memory) for view, _ in ends]
+    widths = [assumed(case, view, skin, memory) for view, _ in ends]
     breath = _breath(case)
 
     def make() -> TriangleMesh:
-        return joined([beyond_image(*end, one.wider_mm, breath) for end, one in zip(ends, found, strict=True)])
+        return joined([beyond_image(*end, one.wider_mm, breath) for end, one in zip(ends, widths, strict=True)])
 
     views = tuple(part.tobytes() for view, _ in ends for part in (view.T_ct_box, view.size_mm, view.cut))
-    key = (__name__, BEYOND_IMAGE, skin.mesh.digest, views, *(one.wider_mm for one in found), breath.tobytes())
+    key = (__name__, BEYOND_IMAGE, skin.mesh.digest, views, *(one.wider_mm for one in widths), breath.tobytes())
     mesh = make() if of_scan is not None else memory.get(key, make, lambda solid: solid.nbytes)
     solid = Structure(BEYOND_IMAGE, Role.UNKNOWN, case.ct.margin_mm, mesh, "beyond the image", True, np.zeros((3, 3)))
     own = "; set cut in the skin's table, [] if all of it is skin" if case.skin_section.mesh else ""
-    said = [_finding(view, one, own) for (view, _), one in zip(ends, found, strict=True)]
+    said = [_finding(view, one, own) for (view, _), one in zip(ends, widths, strict=True)]
     return Beyond((solid,), tuple({one.sentence: one for one in said}.values()))
 
 

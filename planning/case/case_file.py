@@ -49,11 +49,11 @@ def _stated_region(value: object) -> object:
     return value
 
 
-def count_difference(stated: int, found: int) -> str:
+def count_difference(stated: int, actual: int) -> str:
     """Sentence on a case with another number of structures than it states; empty where they agree."""
-    if stated == found:
+    if stated == actual:
         return ""
-    return f"structures = {stated} is stated, but the case has {found}, the skin included; was the file cut?"
+    return f"structures = {stated} is stated, but the case has {actual}, the skin included; was the file cut?"
 
 
 class EndSection(Section):
@@ -307,5 +307,5 @@ def _margins(data: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
             yield from ((pattern, avoid, pattern) for pattern in list(avoid))
 
 
-def _tables(found: Any) -> list[dict[str, Any]]:
-    return [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
+def _tables(value: Any) -> list[dict[str, Any]]:
+    return [one for one in value if isinstance(one, dict)] if isinstance(value, list) else []

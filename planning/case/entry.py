@@ -126,8 +126,8 @@ def grid(theta: tuple[float, float], beta: tuple[float, float], step: float, R_c
     if full_circle:
         azimuths = azimuths[:-1]
     polar = _steps(theta, step)
-    found = _directions(np.repeat(polar, len(azimuths)), np.tile(azimuths, len(polar)), R_ct_entry)
-    return replace(found, grid=AngleGrid(polar, azimuths, step, full_circle))
+    directions = _directions(np.repeat(polar, len(azimuths)), np.tile(azimuths, len(polar)), R_ct_entry)
+    return replace(directions, grid=AngleGrid(polar, azimuths, step, full_circle))
 
 
 def _steps(limits: tuple[float, float], step: float) -> Floats:
@@ -179,7 +179,7 @@ class AngleGrid:
         """Directions (θ, β) one step outside of the grid, which nobody has asked about, shape (b,) each."""
         none, polar = np.empty(0), [self.theta[0] - self.step, self.theta[-1] + self.step]
         beyond = [self.theta[0] > SAME_ANGLE, self.theta[-1] < np.pi - SAME_ANGLE]
-        beside = none if self.full_circle else np.array([self.beta[0] - self.step, self.beta[-1] + self.step])
-        rows = (np.array(polar)[beyond], self.beta), (self.theta, beside)
+        azimuths = none if self.full_circle else np.array([self.beta[0] - self.step, self.beta[-1] + self.step])
+        rows = (np.array(polar)[beyond], self.beta), (self.theta, azimuths)
         theta = np.concatenate([np.repeat(one, len(other)) for one, other in rows])
         return np.clip(theta, 0.0, np.pi), np.concatenate([np.tile(other, len(one)) for one, other in rows])

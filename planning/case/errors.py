@@ -198,8 +198,8 @@ def error_model(
     target = reading if section.target_mm is None else section.target_mm**2 * np.eye(3)
     if fle_mm is not None:
         reading, touch = fle_mm**2 / 3 * np.eye(3), 0.0
-    found = section.marker_noise == "found"
-    return ErrorModel(reading, touch, target, _arm(section), section.surface_mm, found)
+    size_found = section.marker_noise == "found"
+    return ErrorModel(reading, touch, target, _arm(section), section.surface_mm, size_found)
 
 
 def _arm(section: ErrorsSection) -> ArmUncertainty:

@@ -89,15 +89,15 @@ def _masks(content: CaseFile, path: Path, single: Sequence[NamedFile]) -> Iterat
     def place(name: str) -> Path:
         return Path(os.path.normpath(path.parent / name))
 
-    beside = [*(one.name for one in single), path.name, getattr(content.tool, "mesh", None), content.robot.urdf]
+    single_files = [*(one.name for one in single), path.name, getattr(content.tool, "mesh", None), content.robot.urdf]
     folders = [many.masks for many in content.structures if many.masks is not None]
-    named = {place(name) for name in (*beside, *folders) if name is not None}
+    named = {place(name) for name in (*single_files, *folders) if name is not None}
     cts = [place(one.name) for one in single if one.role == "ct"]
     series = {*cts, *(one.parent for one in cts)}
 
     def known(one: Path) -> bool:
-        here = Path(os.path.normpath(one))
-        return here in named or (here.parent in series and is_dicom_file(one))
+        normal = Path(os.path.normpath(one))
+        return normal in named or (normal.parent in series and is_dicom_file(one))
 
     for number, many in enumerate(content.structures, start=1):
         if many.masks is not None:
@@ -136,8 +136,8 @@ class CaseVolumes:
             self._sources[name] = self._series[name] = series
             return
         content = self._files.read(role, name, max_bytes=MAX_FILE_BYTES, key=key, where=self._path)
-        beside = data_file(content, path)
-        names = (name,) if beside is None else (name, str(PurePosixPath(name).with_name(beside)))
+        data_name = data_file(content, path)
+        names = (name,) if data_name is None else (name, str(PurePosixPath(name).with_name(data_name)))
         for data in names[1:]:
             self._files.read(f"{role} data", data, max_bytes=MAX_FILE_BYTES, key=key, where=self._path)
         self._sources[name] = VolumeFile(path, names, self._files.content)
@@ -160,11 +160,11 @@ class CaseVolumes:
         if name is None:
             return
         if section.seg is not None and name.lower().endswith(label_sources.SEGMENT_ENDING):
-            found = label_sources.parse_segments(self._path.parent / name, name, self._files.content)
+            segments = label_sources.parse_segments(self._path.parent / name, name, self._files.content)
         else:
-            found = self._drawn(section, name, case_ct)
-        self._masks[name] = found
-        self._sources |= {_key(name, called): mask for called, mask in found.masks.items()}
+            segments = self._drawn(section, name, case_ct)
+        self._masks[name] = segments
+        self._sources |= {_key(name, called): mask for called, mask in segments.masks.items()}
 
     def _drawn(self, section: StructuresSection, name: str, case_ct: str | None) -> NamedMasks:
         """The structures of a DICOM file."""

@@ -338,8 +338,8 @@ def tool_of(section: tables.ToolSection | None, files: InputFiles, path: Path) -
         return None
     unit, file = parse_unit(section.unit, where=f"{path}: tool.unit"), path.parent / section.mesh
     data = files.read(TOOL_ROLE, section.mesh, max_bytes=meshes.MAX_FILE_BYTES, key="tool.mesh", where=path)
-    turn = scipy.spatial.transform.Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
-    T = pose(turn, np.array(section.position_mm))
+    R = scipy.spatial.transform.Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
+    T = pose(R, np.array(section.position_mm))
     mesh = meshes.parse_mesh(data, file, unit=unit, space=Space.LOCAL, up=section.up).transformed(T)
     return ToolBody(mesh, file, unit.mm, T, f"{path}: tool")
 

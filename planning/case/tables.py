@@ -473,7 +473,7 @@ def stated_base_ct(section: RegistrationSection, T_file: Floats) -> Floats:
     """T_base_ct (4, 4), mm, of what a stated transform's file does to a point (4, 4), rigid to the file's digits."""
     U, _, Vt = np.linalg.svd(T_file[:3, :3])
     T = pose(U @ Vt, T_file[:3, 3])
-    return _read_as(T, inverted=section.transform_maps == "base_to_ct", turned=section.base_axes == "RAS")
+    return _read_as(T, inverted=section.transform_maps == "base_to_ct", rotated=section.base_axes == "RAS")
 
 
 def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str, Floats]:
@@ -483,15 +483,15 @@ def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str,
     axes = "LPS" if section.base_axes == "RAS" else "RAS"
     inverted, turned = f'transform_maps = "{maps}"', f'base_axes = "{axes}"'
     return {
-        inverted: _read_as(T, inverted=True, turned=section.base_axes == "RAS"),
-        turned: _read_as(T, inverted=False, turned=axes == "RAS"),
-        f"{inverted} and {turned}": _read_as(T, inverted=True, turned=axes == "RAS"),
+        inverted: _read_as(T, inverted=True, rotated=section.base_axes == "RAS"),
+        turned: _read_as(T, inverted=False, rotated=axes == "RAS"),
+        f"{inverted} and {turned}": _read_as(T, inverted=True, rotated=axes == "RAS"),
     }
 
 
-def _read_as(T: Floats, *, inverted: bool, turned: bool) -> Floats:
+def _read_as(T: Floats, *, inverted: bool, rotated: bool) -> Floats:
     T = inverse(T) if inverted else T
-    return np.asarray(RAS_OF_LPS @ T if turned else T)
+    return np.asarray(RAS_OF_LPS @ T if rotated else T)
 
 
 Millimetres = Annotated[Number, Field(ge=0, le=100)]

@@ -101,9 +101,9 @@ FINE_SIDES = 96
 
 def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
     """Corners of a prism about a cylinder along z, centred: shape (2 ``sides``, 3), mm; those of one end first."""
-    turn = 2.0 * np.pi * np.arange(sides) / sides
+    angles = 2.0 * np.pi * np.arange(sides) / sides
     outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)  # circumscribed: encloses the circle
-    ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    ring = outer * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     half = length_mm / 2.0 + SLACK_MM
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
 
@@ -356,8 +356,8 @@ class FclSkin:
         (lows, highs), near = self._bounds, np.empty(len(self._parts), np.bool_)
         if not boxes_near(lows, highs, pose.getRotation(), pose.getTranslation(), *box, ROUNDING_MM, near):
             return []
-        found: list[int] = np.flatnonzero(near).tolist()
-        return found
+        rows: list[int] = np.flatnonzero(near).tolist()
+        return rows
 
     @cached_property
     def _loose(self) -> LooseParts:

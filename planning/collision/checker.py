@@ -108,11 +108,11 @@ class SweptBodies:
         that; where one is, both its ends are taken.
         """
         moved = np.concatenate([[0.0], np.cumsum(self.bounds_mm(q_path).max(axis=1))])
-        kept, last = [0], len(moved) - 1
+        rows, last = [0], len(moved) - 1
         for row in range(1, last):
-            if moved[row + 1] - moved[kept[-1]] > 2.0 * mm:
-                kept.append(row)
-        return np.unique([*kept, last])
+            if moved[row + 1] - moved[rows[-1]] > 2.0 * mm:
+                rows.append(row)
+        return np.unique([*rows, last])
 
     def moving(self, q_path: Floats) -> tuple[Floats, Floats, Floats]:
         """A path's frames, and how far bodies and joints may have moved since its first state; ``q_path`` (m, 6), rad.
@@ -256,11 +256,11 @@ class CellChecker:
         Raises InputError: If a state is not finite.
         """
         before = [check for check in self._checks if check.before_last_joint]
-        found = np.zeros(len(q), np.bool_)
+        in_contact = np.zeros(len(q), np.bool_)
         for row, state in enumerate(q):
             self._place(state)
-            found[row] = any(check.contact_found() is not None for check in before)
-        return found
+            in_contact[row] = any(check.contact_found() is not None for check in before)
+        return in_contact
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of a path (m, 6), rad, with a contact, and the contact; None when all are clear.

@@ -80,29 +80,29 @@ class FastChecker(CellChecker):
         tested, known = np.stack([mask, mask & ~self._round]), np.zeros(len(states), np.int64)
         if round_clear is not None:
             known[round_clear] = 1
-        return self._first_found(frames, tested, known)
+        return self._first_contacts(frames, tested, known)
 
     def folded(self, q: Floats) -> Bools:
         """See :meth:`CellChecker.folded`."""
         states = np.asarray(q, dtype=np.float64).reshape(-1, 6)
         require_finite(states)
         frames, all_alike = link_poses(self.model, states), np.zeros(len(states), np.int64)
-        found = self._first_found(frames, self._before_last[None], all_alike)
-        return np.array([contact is not None for contact in found], np.bool_)
+        contacts = self._first_contacts(frames, self._before_last[None], all_alike)
+        return np.array([contact is not None for contact in contacts], np.bool_)
 
-    def _first_found(self, frames: Floats, tested: Bools, of_state: Ints) -> list[Contact | None]:
+    def _first_contacts(self, frames: Floats, tested: Bools, of_state: Ints) -> list[Contact | None]:
         """The first contact of each state, see :meth:`Proofs.first_not_clear`."""
-        found: list[Contact | None] = [None] * len(frames)
+        contacts: list[Contact | None] = [None] * len(frames)
         begins = np.zeros(len(frames), dtype=np.int64)
         while (left := self._proofs.first_not_clear(frames, begins, tested, of_state)).checks.max(initial=-1) >= 0:
             begins = np.where(left.checks < 0, len(self._tested), left.checks + 1)
             rows = np.flatnonzero(left.checks >= 0)
             of_rows = left.checks[rows].tolist(), left.answers[rows].tolist()
             for row, check, answer in zip(rows.tolist(), *of_rows, strict=True):
-                found[row] = self._contact_of(check, answer, frames[row])
-                if found[row] is not None:
+                contacts[row] = self._contact_of(check, answer, frames[row])
+                if contacts[row] is not None:
                     begins[row] = len(self._tested)
-        return found
+        return contacts
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """See :meth:`CellChecker.first_contact`."""

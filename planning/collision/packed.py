@@ -400,11 +400,11 @@ def _check_leaves(mesh: TriangleMesh, leaves: Arrays) -> None:
     rows, boxes = leaves["rows"], (leaves["lows"], leaves["highs"])
     if rows.dtype != np.int32 or any(box.dtype != np.float64 or box.shape != (len(rows), 3) for box in boxes):
         raise TypeError("leaves of other types than ours")
-    found = np.zeros(len(mesh.faces), np.bool_)
-    if rows.ndim != 2 or len(rows).bit_count() != 1 or rows.min() < 0 or rows.max() >= len(found):
+    in_leaf = np.zeros(len(mesh.faces), np.bool_)
+    if rows.ndim != 2 or len(rows).bit_count() != 1 or rows.min() < 0 or rows.max() >= len(in_leaf):
         raise ValueError("no leaves of this mesh")
-    found[rows] = True
-    if not found.all():
+    in_leaf[rows] = True
+    if not in_leaf.all():
         raise ValueError("a triangle is in no leaf")
 
 
@@ -419,12 +419,12 @@ def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache)
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
         return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3), np.zeros((1, 1), np.bool_))
-    kept, (low, high) = TriangleTree.of(patient, cache), patient.bounds
+    leaves, (low, high) = TriangleTree.of(patient, cache), patient.bounds
     margin = FIELD_MARGIN_MM
     while np.prod(cells := np.ceil((high - low + 2.0 * margin) / CELL_MM).astype(np.int64)) > MOST_CELLS:
         margin = margin / 2.0 if margin > 1.0 else 0.0
         if margin == 0.0:
             cells = np.ones(3, np.int64)
             break
-    tree, field = (kept.lows, kept.highs, kept.corners), np.full(cells, np.nan, np.float32)
-    return SkinTree(tree, field, low - margin, kept.rows >= skin_triangles)
+    tree, field = (leaves.lows, leaves.highs, leaves.corners), np.full(cells, np.nan, np.float32)
+    return SkinTree(tree, field, low - margin, leaves.rows >= skin_triangles)

@@ -75,10 +75,10 @@ class Proofs:
         skin_triangles: int,
         cache: Cache,
     ) -> None:
-        beside_skin = [check.second_body for check in checks if check.hulls is None]
-        finer = {body.name: finer_prism(body.full.hulls[0]) for body in beside_skin if body.name in ROUND}
+        against_skin = [check.second_body for check in checks if check.hulls is None]
+        finer = {body.name: finer_prism(body.full.hulls[0]) for body in against_skin if body.name in ROUND}
         hulls, rows = PackedHulls(boxes), []
-        roots, spheres = packed_trees(beside_skin, cache)
+        roots, spheres = packed_trees(against_skin, cache)
         for check in checks:
             frame = check.second_body.frame
             if check.hulls is None:
@@ -107,11 +107,11 @@ class Proofs:
 
     def drop(self, never: Bools) -> None:
         """Drop some checks (k,) for good: the others keep their order."""
-        kept = ~never
-        self.scene = self.scene._replace(checks=self.scene.checks[kept])
-        self.movers = self.movers._replace(of_check=self.movers.of_check[kept])
-        self._levers, self.joint_spans = self._levers[kept], self.joint_spans[kept]
-        self._work = proof_scratch(int(kept.sum()), len(self.scene.hulls.radii))
+        others = ~never
+        self.scene = self.scene._replace(checks=self.scene.checks[others])
+        self.movers = self.movers._replace(of_check=self.movers.of_check[others])
+        self._levers, self.joint_spans = self._levers[others], self.joint_spans[others]
+        self._work = proof_scratch(int(others.sum()), len(self.scene.hulls.radii))
 
     def unproven(
         self, motion: Motion, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
@@ -134,11 +134,11 @@ class Proofs:
             tested: Shape (t, k): which checks, in so many choices.
             of_state: Shape (m,): which of the choices.
         """
-        found = NotClear(np.empty(len(frames), np.int64), np.empty(len(frames), np.int64))
+        not_clear = NotClear(np.empty(len(frames), np.int64), np.empty(len(frames), np.int64))
         settled_kernels.first_not_clear(
-            self.scene, frames, self._work, self._on_triangle, tested, of_state, begins, *found
+            self.scene, frames, self._work, self._on_triangle, tested, of_state, begins, *not_clear
         )
-        return found
+        return not_clear
 
     def not_clear(self, motion: Motion, tested: Bools) -> Iterator[tuple[int, int, int]]:
         """The states of a path, each with the checks, in order, that are not proven clear there, and their results.
@@ -147,8 +147,8 @@ class Proofs:
         """
         arguments = (self.scene, self._levers, tuple(motion), self._work, self._on_triangle)
         due = np.zeros(len(self), np.int64)
-        while (found := settled_kernels.next_not_clear(*arguments, due, tested))[0] >= 0:
-            yield *divmod(int(found[0]), len(self)), int(found[1])
+        while (state := settled_kernels.next_not_clear(*arguments, due, tested))[0] >= 0:
+            yield *divmod(int(state[0]), len(self)), int(state[1])
 
     def clear_about(self, frames: Floats, rotations: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.
@@ -223,11 +223,11 @@ def _clear_all_over(model: UrModel, proofs: Proofs, touches: Touches, joint: int
         for square, check in np.argwhere(left.touching).tolist():
             touching[check] = touching[check] or touches(check, frames[square])  # FCL decides at the middle
         still = left.unproven & ~touching
-        kept = still.any(axis=1)
-        if not kept.any():
+        unsettled = still.any(axis=1)
+        if not unsettled.any():
             break
-        middles = (middles[kept, None] + half * QUARTERS).reshape(-1, 2)
-        unproven, half = np.repeat(still[kept], len(QUARTERS), axis=0), half / 2.0
+        middles = (middles[unsettled, None] + half * QUARTERS).reshape(-1, 2)
+        unproven, half = np.repeat(still[unsettled], len(QUARTERS), axis=0), half / 2.0
     else:
         touching |= unproven.any(axis=0)
     return tested & ~touching

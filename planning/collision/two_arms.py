@@ -61,9 +61,9 @@ class BetweenArms:
     def apart(self, q_probe: Floats, q_needle: Floats) -> bool:
         """Whether the two arms keep their clearance."""
         self.place_probe(q_probe)
-        moved = self.T_base1_base2 @ link_poses(self._models[1], q_needle)
+        poses = self.T_base1_base2 @ link_poses(self._models[1], q_needle)
         for body in self.needle_bodies:
-            body.place(moved)
+            body.place(poses)
         ends_first = product(reversed(self.probe_bodies), reversed(self.needle_bodies))  # they touch soonest
         return not any(bodies_touch(first, second) for first, second in ends_first)
 

@@ -149,8 +149,8 @@ def table_lines(text: str, kind: str) -> list[int]:
 
 
 def _key(text: str, key: str, start: int, end: int) -> int | None:
-    found = re.compile(rf"^[ \t]*[\"']?({re.escape(key)})\b", re.MULTILINE).search(text, start, end)
-    return None if found is None else found.start(1)
+    match = re.compile(rf"^[ \t]*[\"']?({re.escape(key)})\b", re.MULTILINE).search(text, start, end)
+    return None if match is None else match.start(1)
 
 
 def _line(text: str, at: int) -> int:

@@ -27,20 +27,25 @@ MOST_SHOWN = 6
 """Windows."""
 
 
-def direction_finding(check: checks_file.CheckSection, found: Explanation) -> Finding:
+def direction_finding(check: checks_file.CheckSection, explanation: Explanation) -> Finding:
     """Differences of one direction from what is expected."""
-    differences = (*_verdict(check, found), *_clearances(check, found), *_least(check, found), *_touch(check, found))
+    differences = (
+        *_verdict(check, explanation),
+        *_clearances(check, explanation),
+        *_least(check, explanation),
+        *_touch(check, explanation),
+    )
     if not differences:
         return Finding()
-    case, arm = shlex.quote(str(found.case.path)), "--arm" if check.arm else "--no-arm"
+    case, arm = shlex.quote(str(explanation.case.path)), "--arm" if check.arm else "--no-arm"
     command = f"run-twin check {case} --theta {check.theta_deg:g} --beta {check.beta_deg:g} {arm} --all"
-    return Finding(differences, (*found.head(), *found.structure_lines()), f"full explanation: {command}")
+    return Finding(differences, (*explanation.head(), *explanation.structure_lines()), f"full explanation: {command}")
 
 
-def _verdict(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
-    row = found.candidates.verdict
+def _verdict(check: checks_file.CheckSection, explanation: Explanation) -> Iterator[Difference]:
+    row = explanation.candidates.verdict
     stated = (
-        ("verdict", check.verdict, found.verdict),
+        ("verdict", check.verdict, explanation.verdict),
         ("reason", None if check.reason is None else check.reason.value, str(row.reason[0])),
         ("structure", check.structure, str(row.structure[0])),
     )
@@ -49,8 +54,8 @@ def _verdict(check: checks_file.CheckSection, found: Explanation) -> Iterator[Di
             yield Difference(f"{what}: expected {want!r}, found {got!r}")
 
 
-def _clearances(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
-    clearances = found.clearances()
+def _clearances(check: checks_file.CheckSection, explanation: Explanation) -> Iterator[Difference]:
+    clearances = explanation.clearances()
     for name, want in check.clearance_mm.items():
         if name not in clearances:
             yield Difference(f"clearance of {name!r}: no such structure; available: {', '.join(clearances)}")
@@ -60,18 +65,18 @@ def _clearances(check: checks_file.CheckSection, found: Explanation) -> Iterator
             yield Difference(line, _number(NewNumber(("clearance_mm", name), got, DIGIT * check.tolerance_mm)))
 
 
-def _least(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
-    want, got = check.min_clearance_mm, float(found.candidates.least_clearance[0])
+def _least(check: checks_file.CheckSection, explanation: Explanation) -> Iterator[Difference]:
+    want, got = check.min_clearance_mm, float(explanation.candidates.least_clearance[0])
     if want is not None and not got >= want:
-        line = f"min_clearance_mm: expected at least {want:g} mm, found {got:.4f} mm, {found.nearest_demanding()}"
+        line = f"min_clearance_mm: expected at least {want:g} mm, found {got:.4f} mm, {explanation.nearest_demanding()}"
         yield Difference(line, _number(NewNumber(("min_clearance_mm",), got, LEAST_DIGIT_MM, ROUND_FLOOR)))
 
 
-def _touch(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
-    want, chances = check.max_touch, found.candidates.chances
+def _touch(check: checks_file.CheckSection, explanation: Explanation) -> Iterator[Difference]:
+    want, chances = check.max_touch, explanation.candidates.chances
     if want is None:
         return
-    if found.case.errors is None:
+    if explanation.case.errors is None:
         yield Difference("max_touch: the case declares no [errors], so the chance to touch is not known")
     elif chances is None or not np.isfinite(chances.touch_any[0]):
         need = "a direction that is safe for the organs and the arm" if check.arm else "arm = true"
@@ -177,10 +182,10 @@ class CollisionItem(pytest.Item):
         if table.kind != "plan":
             context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
             self.user_properties += [("case", str(table.case)), (runs.ARM_PROPERTY, context.arm_note)]
-        found = _found(session, table, self.path.parent)
-        numbers = [one.number for one in found.differences if one.number is not None]
-        if len(numbers) < len(found.differences) or (numbers and not updating(self.config)):
-            raise CollisionMismatchError(found.text(table.expected.why))
+        finding = _finding_of(session, table, self.path.parent)
+        numbers = [one.number for one in finding.differences if one.number is not None]
+        if len(numbers) < len(finding.differences) or (numbers and not updating(self.config)):
+            raise CollisionMismatchError(finding.text(table.expected.why))
         for number in numbers:
             session.change(self.path, table.data, runs.Change(table.kind, table.at, self.name, number))
 
@@ -201,11 +206,11 @@ class CollisionItem(pytest.Item):
 def check_in_python(config: pytest.Config, case: Path, keys: Mapping[str, Any]) -> Explanation:
     """Check a direction by the keys of a ``[[check]]`` table; what differs is raised."""
     check = checks_file.CheckSection(**keys)
-    found = _explained(session_of(config), case, check)
-    finding = direction_finding(check, found)
+    explanation = _explained(session_of(config), case, check)
+    finding = direction_finding(check, explanation)
     if finding.differences:
         raise CollisionMismatchError(finding.text(check.why))
-    return found
+    return explanation
 
 
 def _explained(session: Session, case: Path, check: checks_file.CheckSection) -> Explanation:
@@ -213,7 +218,7 @@ def _explained(session: Session, case: Path, check: checks_file.CheckSection) ->
     return context.explain(float(np.radians(check.theta_deg)), float(np.radians(check.beta_deg)))
 
 
-def _found(session: Session, table: Table, folder: Path) -> Finding:
+def _finding_of(session: Session, table: Table, folder: Path) -> Finding:
     expected = table.expected
     if isinstance(expected, checks_file.CheckSection):
         return direction_finding(expected, _explained(session, table.case, expected))

@@ -70,8 +70,8 @@ def declared(case: Case) -> Iterator[Finding]:
         yield Finding("declared", Severity.WARNING, sentence)
 
 
-def _refuse(case: Case, found: Sequence[Finding]) -> None:
-    refused = [one for one in found if one.severity is Severity.REFUSAL]
+def _refuse(case: Case, reported: Sequence[Finding]) -> None:
+    refused = [one for one in reported if one.severity is Severity.REFUSAL]
     if not refused:
         return
     kind = InputError if len(refused) == 1 else InputListError
@@ -90,8 +90,8 @@ def markers(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Ca
         return
     if placement.registration is not None:
         yield from weak_points(placement.registration)
-    found = placement_findings(case, Surroundings(anatomy.skin, anatomy.couch), placement, cache)
-    yield from (one for one in found if one.severity is Severity.WARNING)
+    of_placement = placement_findings(case, Surroundings(anatomy.skin, anatomy.couch), placement, cache)
+    yield from (one for one in of_placement if one.severity is Severity.WARNING)
 
 
 def thick_slices(case: Case, anatomy: Anatomy) -> Iterator[Finding]:

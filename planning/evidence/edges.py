@@ -263,33 +263,33 @@ class Compared(NamedTuple):
 
 def compare(image: EdgeImage, sample: Sample, placements: Sequence[Placement]) -> Compared:
     """Compare placements with the surfaces as they are."""
-    here = image.strength(sample.points_ct, sample.normals_ct)
+    as_is = image.strength(sample.points_ct, sample.normals_ct)
     owner = np.zeros(int(sample.patch.max()) + 1, np.intp)
     owner[sample.patch] = sample.structure
     fits, own_z, own_ratio = [], [], []
     for placement in placements:
-        there = image.strength(*sample.placed(placement.T))
-        fits.append(fit_of(placement, sample, here, there))
-        before, after = _seen(here, there)
+        elsewhere = image.strength(*sample.placed(placement.T))
+        fits.append(fit_of(placement, sample, as_is, elsewhere))
+        before, after = _seen(as_is, elsewhere)
         gain = _sums(after - before, sample.patch)
         own_z.append(_z(_sums(gain, owner), _sums(gain**2, owner)))
         own_ratio.append(_sums(after, sample.structure) / np.maximum(_sums(before, sample.structure), LEAST_SUM))
     return Compared(tuple(fits), np.array(own_z), np.array(own_ratio))
 
 
-def fit_of(placement: Placement, sample: Sample, here: Floats, there: Floats) -> Fit:
+def fit_of(placement: Placement, sample: Sample, as_is: Floats, elsewhere: Floats) -> Fit:
     """Z and ratio of edge strengths (n,) at a placement, and as it is; NaN outside of the image."""
-    before, after = _seen(here, there)
+    before, after = _seen(as_is, elsewhere)
     gain = _sums(after - before, sample.patch)
-    seen = np.count_nonzero(np.isfinite(here) & np.isfinite(there))
-    enough = seen >= LEAST_SEEN * max(1, int(np.count_nonzero(np.isfinite(here))))
+    seen = np.count_nonzero(np.isfinite(as_is) & np.isfinite(elsewhere))
+    enough = seen >= LEAST_SEEN * max(1, int(np.count_nonzero(np.isfinite(as_is))))
     z = float(_z(gain.sum(), gain @ gain)) if enough else -np.inf
     return Fit(placement, z, float(after.sum() / max(before.sum(), LEAST_SUM)))
 
 
-def _seen(here: Floats, there: Floats) -> tuple[Floats, Floats]:
-    both = np.isfinite(here) & np.isfinite(there)
-    return np.where(both, here, 0.0), np.where(both, there, 0.0)
+def _seen(as_is: Floats, elsewhere: Floats) -> tuple[Floats, Floats]:
+    both = np.isfinite(as_is) & np.isfinite(elsewhere)
+    return np.where(both, as_is, 0.0), np.where(both, elsewhere, 0.0)
 
 
 def settled(image: EdgeImage, sample: Sample) -> Floats:
@@ -343,5 +343,5 @@ def refined(image: EdgeImage, sample: Sample, start: Placement, most_mm: float =
 
     simplex = np.vstack([np.zeros(7), np.eye(7) * step_mm])
     options = {"initial_simplex": simplex, "maxfev": 400, "xatol": 0.1, "fatol": 1e-4}
-    found = scipy.optimize.minimize(loss, np.zeros(7), method="Nelder-Mead", options=options)
-    return start._replace(T=moved(np.asarray(found.x)))
+    minimum = scipy.optimize.minimize(loss, np.zeros(7), method="Nelder-Mead", options=options)
+    return start._replace(T=moved(np.asarray(minimum.x)))

@@ -75,7 +75,7 @@ def shared(meshes: Sequence[TriangleMesh]) -> list[Shared]:
     first = np.floor((bounds[:, 0] - low) / cell).astype(int)
     count = np.ceil((bounds[:, 1] - low) / cell).astype(int) + 1 - first
     owner = np.full((first + count).max(axis=0), -1, np.int16)
-    cells, found = np.zeros(len(meshes)), []
+    cells, pairs = np.zeros(len(meshes)), []
     for row in np.argsort(-np.prod(bounds[:, 1] - bounds[:, 0], axis=1), kind="stable"):
         T_ct_cell = np.diag([cell, cell, cell, 1.0])
         T_ct_cell[:3, 3] = low + cell * first[row]
@@ -87,8 +87,8 @@ def shared(meshes: Sequence[TriangleMesh]) -> list[Shared]:
         part[inside] = row
         for other in np.flatnonzero(both >= LEAST_CELLS):
             small, large = sorted((int(row), int(other)), key=lambda one: cells[one])
-            found.append(Shared(small, large, float(both[other] / cells[small]), float(both[other] * cell**3 / 1000)))
-    return found
+            pairs.append(Shared(small, large, float(both[other] / cells[small]), float(both[other] * cell**3 / 1000)))
+    return pairs
 
 
 def overlaps(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding]:
@@ -214,9 +214,9 @@ def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Boo
     seen = np.all((centres >= points.min(axis=0) - around_mm) & (centres <= points.max(axis=0) + around_mm), axis=1)
     for one in np.unique(size[seen]):
         rows, left = np.flatnonzero(seen & (size == one)), np.flatnonzero(~near)
-        found = scipy.spatial.cKDTree(centres[rows]).query_ball_point(points[left], distance_mm[left] + 2.0**one)
-        point = np.repeat(left, [len(some) for some in found])
-        triangle = rows[[row for some in found for row in some]]
+        neighbours = scipy.spatial.cKDTree(centres[rows]).query_ball_point(points[left], distance_mm[left] + 2.0**one)
+        point = np.repeat(left, [len(some) for some in neighbours])
+        triangle = rows[[row for some in neighbours for row in some]]
         squares = squared_distance(points[point], corners[triangle])
         near[point[squares <= distance_mm[point] ** 2]] = True
     return near
@@ -224,16 +224,16 @@ def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Boo
 
 def _inner_point(mesh: TriangleMesh) -> Floats:
     """A point deep in a closed surface: of some lines from beside it the middle of the longest first way through."""
-    (low, high), beside = mesh.bounds, np.array([LEAST_TOLERANCE_MM, 0.0, 0.0])
-    start = np.array([low[0], *(low + high)[1:] / 2.0]) - beside
+    (low, high), margin = mesh.bounds, np.array([LEAST_TOLERANCE_MM, 0.0, 0.0])
+    start = np.array([low[0], *(low + high)[1:] / 2.0]) - margin
     away = spread_on(mesh, AIMS).points - start
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    found = crossings(mesh, start, away)
-    first = found.first[(found.count > 0) & (found.count % 2 == 0)]
+    crossed = crossings(mesh, start, away)
+    first = crossed.first[(crossed.count > 0) & (crossed.count % 2 == 0)]
     if len(first) == 0:
         return np.asarray((low + high) / 2.0)
-    into = first[np.argmax(found.depth[first + 1] - found.depth[first])]
-    return np.asarray(start + away[found.ray[into]] * found.depth[into : into + 2].mean())
+    into = first[np.argmax(crossed.depth[first + 1] - crossed.depth[first])]
+    return np.asarray(start + away[crossed.ray[into]] * crossed.depth[into : into + 2].mean())
 
 
 def _before_skin(points: Floats, skin: Skin) -> Bools:
@@ -242,8 +242,8 @@ def _before_skin(points: Floats, skin: Skin) -> Bools:
     away = points - inner_ct
     distance = np.linalg.norm(away, axis=1)
     away[distance == 0] = (0.0, 0.0, 1.0)
-    found, _ = consistent_crossings(skin.mesh, inner_ct, away / np.where(distance == 0, 1.0, distance)[:, None])
-    before = found.ray[found.depth < distance[found.ray]]
+    crossed, _ = consistent_crossings(skin.mesh, inner_ct, away / np.where(distance == 0, 1.0, distance)[:, None])
+    before = crossed.ray[crossed.depth < distance[crossed.ray]]
     return np.bincount(before, minlength=len(points)) % 2 == 0
 
 
@@ -260,9 +260,9 @@ def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding
     """An organ that is elsewhere protects nothing; what is `unknown`, or a ball about the target, may lie anywhere."""
     known = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
     placed = [structure for structure in known if structure.source != OWN_TARGET]
-    beside = [structure for structure in placed if _wholly_outside(anatomy.skin, structure)]
-    if beside:
-        said = f"structure '{beside[0].name}' is completely outside the skin: wrong space (LPS/RAS) or unit?"
+    elsewhere = [structure for structure in placed if _wholly_outside(anatomy.skin, structure)]
+    if elsewhere:
+        said = f"structure '{elsewhere[0].name}' is completely outside the skin: wrong space (LPS/RAS) or unit?"
         yield Finding(CODE, Severity.REFUSAL, said, way_out="structures that reach into the body")
         return
     if not anatomy.skin.mesh.closed:
@@ -279,8 +279,8 @@ def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding
     made_from |= {"meshes": [mesh.digest for mesh in meshes]}
 
     def make() -> Arrays:
-        found = inside_skin(meshes, anatomy.skin, np.array(tolerances))
-        return {"counts": np.array(found, np.int64).reshape(-1, 3)}
+        counts = inside_skin(meshes, anatomy.skin, np.array(tolerances))
+        return {"counts": np.array(counts, np.int64).reshape(-1, 3)}
 
     counts = cache.arrays(made_from, make, by=__name__)["counts"].tolist()
     for structure, part in zip(placed, (Inside(*one) for one in counts), strict=True):

@@ -101,7 +101,7 @@ class Source:
         middles = self.middles[: 1 if np.allclose(*self.middles, atol=edges.LEAST_SHIFT_MM) else 2]
         low, high = box_of(np.concatenate([mesh.bounds for mesh in self.meshes.values()]))
         across = np.abs(self.axes.T) @ (high - low)
-        found = [
+        placements = [
             *edges.shifts(self.axes, self.voxel_mm, across / 3.0),
             *edges.turns((low + high) / 2.0, self.axes),
             *edges.scalings([middles[0], self.first]),
@@ -109,10 +109,10 @@ class Source:
         ]
         if self.in_units:
             units = edges.scalings([np.zeros(3)], UNITS, "unit")
-            found += [one for one in units if one.T[0, 0] * across.max() > LEAST_EXTENT_MM]
+            placements += [one for one in units if one.T[0, 0] * across.max() > LEAST_EXTENT_MM]
         if self.grid_slip is not None:
-            found.append(edges.Placement("grid", self.grid_slip))
-        return found
+            placements.append(edges.Placement("grid", self.grid_slip))
+        return placements
 
 
 class Assessed(NamedTuple):
@@ -164,11 +164,11 @@ def assess(image: edges.EdgeImage, source: Source) -> Assessed:
         named = edges.compare(image, sample.moved(ahead.placement.T), shifts).best.z <= -WARNING_Z
     outward = np.copysign(1.0, [mesh.volume for mesh in source.meshes.values()])
     inner = sample.points_ct - INSIDE_MM * sample.normals_ct * outward[sample.structure, None]
-    here = _unevenness(image, inner, sample.structure, np.eye(4))
-    alone = Alone(tuple(source.meshes), compared, _alone(image, inner, sample.structure, compared.fits, here))
+    as_is = _unevenness(image, inner, sample.structure, np.eye(4))
+    alone = Alone(tuple(source.meshes), compared, _alone(image, inner, sample.structure, compared.fits, as_is))
     seen = np.bincount(sample.structure, np.isfinite(image.hu_at(sample.points_ct))) / np.bincount(sample.structure)
-    there = _unevenness(image, inner, sample.structure, ahead.placement.T)
-    both = np.isfinite(there + here)
+    ahead_uneven = _unevenness(image, inner, sample.structure, ahead.placement.T)
+    both = np.isfinite(ahead_uneven + as_is)
     left = [ahead.placement.kind] if ahead.z >= WARNING_Z else []
     left += [fit.placement.kind for fit in compared.fits if not _excluded(fit)]
     return Assessed(
@@ -183,23 +183,23 @@ def assess(image: edges.EdgeImage, source: Source) -> Assessed:
         agreeing=alone.agreeing,
         unconfirmed=alone.anywhere(UNCONFIRMED),
         unseen=alone.names_of(seen < edges.LEAST_SEEN),
-        uneven=float(there[both].sum() / here[both].sum()) if both.any() else 1.0,
+        uneven=float(ahead_uneven[both].sum() / as_is[both].sum()) if both.any() else 1.0,
     )
 
 
 def _ahead(image: edges.EdgeImage, sample: edges.Sample, source: Source, best: edges.Fit) -> edges.Fit:
     """The place at which the surfaces lie best, near a better one or near where they are, against what is no slip."""
     near = edges.refined(image, sample, AS_IT_IS, most_mm=edges.LEAST_SHIFT_MM / 2.0).T
-    here, found = edges.settled(image, sample.moved(near)), [best]
+    as_is, fits = edges.settled(image, sample.moved(near)), [best]
     if best.z >= WARNING_Z:
         place = best.placement if best.placement.kind == "grid" else edges.refined(image, sample, best.placement)
-        found = [edges.fit_of(place, sample, here, edges.settled(image, sample.moved(place.T)))]
-        if place.kind == "grid" and found[0].z >= WARNING_Z:
-            return found[0]
+        fits = [edges.fit_of(place, sample, as_is, edges.settled(image, sample.moved(place.T)))]
+        if place.kind == "grid" and fits[0].z >= WARNING_Z:
+            return fits[0]
     place = edges.refined(image, sample, AS_IT_IS)
     if _slip(sample, place.T, source) >= LEAST_SLIP[place.kind]:
-        found.append(edges.fit_of(place, sample, here, edges.settled(image, sample.moved(place.T))))
-    return max(found, key=lambda fit: fit.z)
+        fits.append(edges.fit_of(place, sample, as_is, edges.settled(image, sample.moved(place.T))))
+    return max(fits, key=lambda fit: fit.z)
 
 
 def _slip(sample: edges.Sample, T: Floats, source: Source) -> float:
@@ -245,27 +245,27 @@ class Alone(NamedTuple):
 
 
 def _alone(
-    image: edges.EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], fits: Sequence[edges.Fit], here: Floats
+    image: edges.EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], fits: Sequence[edges.Fit], as_is: Floats
 ) -> Floats:
     """Unevenness at each place to that as it is, shape (placements, structures).
 
     Only shifted or in the other space: of all mirror images and turns some has stronger edges than an organ that is as
     dense as what is around it, or than a lung that is full.
     """
-    there = np.full((len(fits), len(here)), np.nan)
+    elsewhere = np.full((len(fits), len(as_is)), np.nan)
     for row, (kind, T) in enumerate(fit.placement for fit in fits):
         if kind == "shift" or (T == OTHER_SPACE).all():
-            there[row] = _unevenness(image, inner_ct, structure, T)
-    return there / here
+            elsewhere[row] = _unevenness(image, inner_ct, structure, T)
+    return elsewhere / as_is
 
 
 def _unevenness(image: edges.EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], T: Floats) -> Floats:
     """Of each structure, placed by T (4, 4): the mean deviation of HU at its inner points (n, 3); NaN where unseen."""
-    found = []
+    deviations = []
     for one in np.split(image.hu_at(apply(T, inner_ct)), np.flatnonzero(np.diff(structure)) + 1):
         hu = one[np.isfinite(one)]
-        found.append(np.abs(hu - np.median(hu)).mean() if len(hu) > edges.LEAST_SEEN * len(one) else np.nan)
-    return np.maximum(found, LEAST_HU)
+        deviations.append(np.abs(hu - np.median(hu)).mean() if len(hu) > edges.LEAST_SEEN * len(one) else np.nan)
+    return np.maximum(deviations, LEAST_HU)
 
 
 def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
@@ -283,9 +283,9 @@ def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
         }
 
         def make(source: Source = source) -> Arrays:
-            found = assess(image(), source)
-            T, middle = None if found.T is None else found.T.tolist(), found.middle_ct.tolist()
-            return {"json": np.array(json.dumps(found._asdict() | {"T": T, "middle_ct": middle}))}
+            assessed = assess(image(), source)
+            T, middle = None if assessed.T is None else assessed.T.tolist(), assessed.middle_ct.tolist()
+            return {"json": np.array(json.dumps(assessed._asdict() | {"T": T, "middle_ct": middle}))}
 
         yield from _findings(case, scan, source, scan.source.kept(made_from, make, _read, by=__name__))
 
@@ -320,45 +320,47 @@ def _along(axes: Floats, T_ct_index: Floats) -> Floats:
     return np.asarray(np.abs(axes.T @ T_ct_index[:3, :3]).max(axis=1))
 
 
-def _findings(case: Case, scan: Scan, source: Source, found: Assessed) -> Iterator[Finding]:
+def _findings(case: Case, scan: Scan, source: Source, assessed: Assessed) -> Iterator[Finding]:
     count = len(source.meshes)
     numbers: dict[str, Any] = {"source": source.name, "structures": float(count)}
-    numbers |= {"z": round(found.z, 2)} if np.isfinite(found.z) else {}
-    of = f"{source.name} ({count} structures)" if count > 1 else f"{source.name} ('{next(iter(source.meshes))}')"
-    if found.doubtful:
-        slip = None if found.T is None else slip_of(found.T, found.middle_ct)
-        place = "elsewhere" if slip is None else slip.text(own_grid=found.kind == "grid")
-        sure = "is not" if found.refuses else "may not be"
+    numbers |= {"z": round(assessed.z, 2)} if np.isfinite(assessed.z) else {}
+    source_text = (
+        f"{source.name} ({count} structures)" if count > 1 else f"{source.name} ('{next(iter(source.meshes))}')"
+    )
+    if assessed.doubtful:
+        slip = None if assessed.T is None else slip_of(assessed.T, assessed.middle_ct)
+        place = "elsewhere" if slip is None else slip.text(own_grid=assessed.kind == "grid")
+        sure = "is not" if assessed.refuses else "may not be"
         said = (
-            f"{of} {sure} where {scan.name} shows it: it fits the edges better {place} (z {found.z:.1f}, "
-            f"edges {found.ratio:.2f} times as strong)"
+            f"{source_text} {sure} where {scan.name} shows it: it fits the edges better {place} (z {assessed.z:.1f}, "
+            f"edges {assessed.ratio:.2f} times as strong)"
         )
-        severity = Severity.REFUSAL if found.refuses and not case.ct.trust_labels else Severity.WARNING
+        severity = Severity.REFUSAL if assessed.refuses and not case.ct.trust_labels else Severity.WARNING
         yield Finding(CODE, severity, said, numbers | ({} if slip is None else slip.numbers()), ALLOWED)
-    odd = found.agreeing or found.odd
-    if odd and not found.refuses:
-        names, alike = ", ".join(odd), "at one and the same other place" if found.agreeing else "elsewhere"
+    odd = assessed.agreeing or assessed.odd
+    if odd and not assessed.refuses:
+        names, alike = ", ".join(odd), "at one and the same other place" if assessed.agreeing else "elsewhere"
         said = f"{source.name}: {names} would fit the edges of {scan.name} better {alike}: are they in the right place?"
-        severity = Severity.REFUSAL if found.agreeing and not case.ct.trust_labels else Severity.WARNING
+        severity = Severity.REFUSAL if assessed.agreeing and not case.ct.trust_labels else Severity.WARNING
         yield Finding("structure_beside_image", severity, said, numbers | {"names": names}, ALLOWED)
-    faint = [name for name in found.unconfirmed if name not in {*found.odd, *found.agreeing, *found.unseen}]
-    unsure = [*faint, *found.unseen]
-    if count > 1 and not found.refuses and unsure:  # of which the image does not show where they lie
-        parts = {"no clear edge": faint, "not in the image": [*found.unseen]}
+    faint = [name for name in assessed.unconfirmed if name not in {*assessed.odd, *assessed.agreeing, *assessed.unseen}]
+    unsure = [*faint, *assessed.unseen]
+    if count > 1 and not assessed.refuses and unsure:  # of which the image does not show where they lie
+        parts = {"no clear edge": faint, "not in the image": [*assessed.unseen]}
         why = "".join(f"; {what}: {first_few(some)}" for what, some in parts.items() if some)
         said = f"{source.name}: {scan.name} does not confirm the outline of {len(unsure)} of {count} structures"
         yield Finding("outline_unconfirmed", Severity.NOTE, said + why, numbers | {"names": ", ".join(unsure)})
-    if found.doubtful:
+    if assessed.doubtful:
         return
-    if found.open:
+    if assessed.open:
         said = (
-            f"{of}: the edges of {scan.name} cannot distinguish its place from "
-            f"{', '.join(KINDS[one] for one in found.open)}"
+            f"{source_text}: the edges of {scan.name} cannot distinguish its place from "
+            f"{', '.join(KINDS[one] for one in assessed.open)}"
         )
-        severity = Severity.WARNING if "shift" in found.open else Severity.NOTE
+        severity = Severity.WARNING if "shift" in assessed.open else Severity.NOTE
         yield Finding("edges_cannot_tell", severity, said, numbers)
     else:
-        said = f"{of} as a whole fits the edges of {scan.name}, and fits worse at every other place tried"
+        said = f"{source_text} as a whole fits the edges of {scan.name}, and fits worse at every other place tried"
         yield Finding("labels_on_edges", Severity.NOTE, said, numbers)
 
 

@@ -92,8 +92,8 @@ def readings_inside(
     point_ct: Floats, space: Space, inside: Callable[[Floats], bool], place: str = "in the body"
 ) -> str:
     """The readings of a point (3,), mm, under which it would lie where it belongs, in brackets; else empty."""
-    found = [text for text, point in _readings(point_ct, space) if inside(point)]
-    return f" (read {' or '.join(found)} it lies {place})" if found else ""
+    readings = [text for text, point in _readings(point_ct, space) if inside(point)]
+    return f" (read {' or '.join(readings)} it lies {place})" if readings else ""
 
 
 def _readings(point_ct: Floats, space: Space) -> Iterator[tuple[str, Floats]]:
@@ -122,8 +122,8 @@ def target_in_vessel(case: Case) -> Iterator[Finding]:
     line = default_role(name, "other")
     part = line == LESION and not named_as_crossed(name)
     if part or (line is None and case.region != "phantom"):
-        of = "is like a lesion's only in part" if part else "is not in the table of default roles"
-        said = f"a name that {of}, and every safe path ends in it: is it no vessel?"
+        shortfall = "is like a lesion's only in part" if part else "is not in the table of default roles"
+        said = f"a name that {shortfall}, and every safe path ends in it: is it no vessel?"
         yield Finding("target_name_unknown", Severity.WARNING, f"the target lies in '{name}', {said}")
 
 
@@ -134,13 +134,13 @@ def target_in_other_space(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
     """
     if case.space is Space.LOCAL:
         return
-    here = list(_holders(anatomy, case.target_ct))
-    other = list(_holders(anatomy, to_lps(case.target_ct[None], Space.RAS)[0]))
-    is_, would_be = likely_target(here), likely_target(other)
+    holders = list(_holders(anatomy, case.target_ct))
+    other_holders = list(_holders(anatomy, to_lps(case.target_ct[None], Space.RAS)[0]))
+    is_, would_be = likely_target(holders), likely_target(other_holders)
     if is_ < would_be is Likely.LESION or (is_ is Likely.NOTHING and would_be >= Likely.ORGAN):
-        name = max(other, key=lambda one: likely_target([one]))
+        name = max(other_holders, key=lambda one: likely_target([one]))
         space = Space.RAS if case.space is Space.LPS else Space.LPS
-        place = "in no structure" if not here else f"in {', '.join(here)}"
+        place = "in no structure" if not holders else f"in {', '.join(holders)}"
         yield Finding(
             "target_in_other_space",
             Severity.WARNING,

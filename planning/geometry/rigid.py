@@ -91,10 +91,10 @@ def about_fixed_axes(angles: ArrayLike) -> Floats:
     return _of_quaternion(w * x - c * y, w * y + c * x, w * z + turn * c, w * turn - c * z)
 
 
-def _each(of: Callable[[float], float], angles: Floats) -> Floats:
+def _each(function: Callable[[float], float], angles: Floats) -> Floats:
     """The C library's sine or cosine of angles of any shape; not a number of what is not finite."""
-    found = [of(angle) if math.isfinite(angle) else math.nan for angle in angles.ravel().tolist()]
-    return np.array(found).reshape(angles.shape)
+    values = [function(angle) if math.isfinite(angle) else math.nan for angle in angles.ravel().tolist()]
+    return np.array(values).reshape(angles.shape)
 
 
 def _of_quaternion(x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:

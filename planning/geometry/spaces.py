@@ -47,8 +47,8 @@ def point_text(point_ct: Floats, space: Space) -> str:
 
 def parse_space(text: str, *, where: str) -> Space:
     """The space that a text names, in upper or lower case. Raises InputError: It names none."""
-    found = {space.lower(): space for space in Space}.get(text.strip().lower())
-    return found or refuse(f"unknown space {text!r}", where, ", ".join(Space), "unknown_space")
+    match = {space.lower(): space for space in Space}.get(text.strip().lower())
+    return match or refuse(f"unknown space {text!r}", where, ", ".join(Space), "unknown_space")
 
 
 class Unit(StrEnum):

@@ -105,21 +105,21 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
         refuse(what, case.path, "an [[obstacle]] of that name, or place.table", "no_table")
     span = abs(model.a2) + abs(model.a3) + case.needle.length_mm + FREE_MM
     reach = ROUNDS_MM * math.ceil(span / ROUNDS_MM)  # default distance of a base from the target, rounded up
-    found: list[Region] = []
+    regions: list[Region] = []
     for mount in mounts:
         if mount == "rail":
-            found += [] if table is None else _rails(case, table, T_ct_bed, reach)
+            regions += [] if table is None else _rails(case, table, T_ct_bed, reach)
         elif mount == "side":
             toward = {1: (-reach, 0.0), -1: (0.0, reach), 0: (-reach, reach)}  # level, to the target's side
             for facing, axis in FACINGS.items():
                 sides = (toward[axis[0]], toward[axis[1]], (-ABOVE_MM, reach))
-                found.append(_region("side", facing, axis, settings.side, sides))
+                regions.append(_region("side", facing, axis, settings.side, sides))
         else:
             heights = (-reach, ABOVE_MM) if mount == "floor" else (-ABOVE_MM, reach)
             up = (0, 0, 1) if mount == "floor" else (0, 0, -1)
             bounds = settings.floor if mount == "floor" else settings.ceiling
-            found.append(_region(mount, "", up, bounds, ((-reach, reach), (-reach, reach), heights)))
-    return tuple(found)
+            regions.append(_region(mount, "", up, bounds, ((-reach, reach), (-reach, reach), heights)))
+    return tuple(regions)
 
 
 def _region(
@@ -136,13 +136,13 @@ def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[
     bounds = case.place.rail
     height = bounds.height_mm if bounds.height_mm is not None else (-RAIL_MM, RAIL_MM)
     top = float(centre[2] + half[2])
-    found = []
+    regions = []
     for facing, side in (("+across", 1.0), ("-across", -1.0)):
         across = float(centre[1] + side * (half[1] + case.place.rail_gap_mm))
         defaults = ((-reach, reach), (across, across), (0.0, 0.0))
         heights = MountBounds(along_mm=bounds.along_mm, height_mm=(top + height[0], top + height[1]))
-        found.append(_region("rail", facing, (0, 0, 1), heights, defaults))
-    return found
+        regions.append(_region("rail", facing, (0, 0, 1), heights, defaults))
+    return regions
 
 
 def mount_section(T_ct_base: Floats, space: Space) -> MountSection:

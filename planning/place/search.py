@@ -514,10 +514,10 @@ EXPECTED = "expected_error_mm"
 """A further column where the case declares errors and has markers."""
 
 
-def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
+def placement_rows(search: PlaceSearch) -> list[dict[str, Any]]:
     """One row a checked placement, best first, rank 1; the case's own comes last, without a rank."""
     rows = []
-    for number, one in enumerate(found.every, start=1):
+    for number, one in enumerate(search.every, start=1):
         rank, position = (number, one.site.position) if one.site is not None else (None, (None, None, None))
         verdict = one.verdict
         result = (verdict.fraction, verdict.reached, verdict.count, verdict.margin, verdict.home_contact)
@@ -526,38 +526,38 @@ def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
     return rows
 
 
-def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
+def place_document(search: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Everything as plain values: mm; fractions and margins 0..1."""
-    rows = placement_rows(found)
-    for row, one in zip(rows, found.every, strict=True):
+    rows = placement_rows(search)
+    for row, one in zip(rows, search.every, strict=True):
         row["mount"] = {key: list(value) for key, value in one.mount.model_dump().items()}
         row["reasons"] = dict(one.verdict.reasons)
         row["estimate"] = None
         if one.estimate is not None:
             row["estimate"] = dict(zip(("reach", "share", "margin"), one.estimate, strict=True))
-    best = found.rated[0] if found.rated else None
+    best = search.rated[0] if search.rated else None
     return {
         "version": PLACE_VERSION,
         **provenance,
-        "T_ct_bed": np.asarray(found.T_ct_bed).tolist(),
-        "sites": {"coarse": len(found.coarse), "refined": found.refined, "judged": len(found.rated)},
-        "possible_share": found.possible,
+        "T_ct_bed": np.asarray(search.T_ct_bed).tolist(),
+        "sites": {"coarse": len(search.coarse), "refined": search.refined, "judged": len(search.rated)},
+        "possible_share": search.possible,
         "search": {
-            "complete": found.complete,
-            "checked": found.checked[0],
-            "to_check": found.checked[1],
-            "directions": found.directions,
-            "resolution_mm": found.resolution_mm,
+            "complete": search.complete,
+            "checked": search.checked[0],
+            "to_check": search.checked[1],
+            "directions": search.directions,
+            "resolution_mm": search.resolution_mm,
         },
         "placements": rows,
         "mount_lines": None if best is None else mount_lines(best.mount),
     }
 
 
-def write_placements(found: PlaceSearch, path: Path) -> None:
+def write_placements(search: PlaceSearch, path: Path) -> None:
     """Write the table as CSV, whole or not at all."""
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        rows = placement_rows(found)
+        rows = placement_rows(search)
         writer = csv.DictWriter(stream, (*COLUMNS, *([EXPECTED] if any(EXPECTED in row for row in rows) else [])))
         writer.writeheader()
         writer.writerows(rows)

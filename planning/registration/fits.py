@@ -158,10 +158,10 @@ def _gauss_newton(
     R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
     for _ in range(STEPS):
         fitted = points_ct @ np.swapaxes(R, -1, -2) + t[..., None, :]
-        moved = step(R, design_blocks(fitted, center), points_base - fitted)
-        turn = exp_rotation(moved[..., 3:])
-        t = (turn @ (t - center)[..., None])[..., 0] + center + moved[..., :3]
-        R = turn @ R
+        increment = step(R, design_blocks(fitted, center), points_base - fitted)
+        dR = exp_rotation(increment[..., 3:])
+        t = (dR @ (t - center)[..., None])[..., 0] + center + increment[..., :3]
+        R = dR @ R
     U, _, Vt = np.linalg.svd(R)  # products of rotations drift from one by rounding
     return pose(U @ Vt, t)
 

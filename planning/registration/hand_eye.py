@@ -364,8 +364,8 @@ def _least_squares(pairs: PosePairs, start: _Value, sigma: Floats) -> _Value:
 def _refuse_rotations(pairs: PosePairs) -> NoReturn:
     """Refuse poses that cannot show every unknown, by what their rotations lack."""
     R = pairs.A[:, :3, :3]
-    turns = log_rotation(R if pairs.motions else nearest_rotation(R.mean(axis=0)).T @ R)
-    sizes, axes = np.linalg.svd(turns / np.sqrt(len(turns)), full_matrices=False)[1:]
+    rotations = log_rotation(R if pairs.motions else nearest_rotation(R.mean(axis=0)).T @ R)
+    sizes, axes = np.linalg.svd(rotations / np.sqrt(len(rotations)), full_matrices=False)[1:]
     allowed = "rotations of 10 degrees or more about two axes of the flange that are not parallel"
     if sizes[0] < LEAST_TURN:
         what = "the flange hardly rotates: the camera's place on it can shift in any direction"

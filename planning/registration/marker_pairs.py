@@ -159,8 +159,8 @@ def renamings(markers: MarkerPairs, target_ct: Floats, alike_mm: float, *, movin
     complete = orders is not None
     fitting = _fitting_swaps(x, y, bound) if orders is None else orders[rigid_rss(x, y[orders]) <= bound]
     T_given = fit_rigid(markers.points_ct, markers.points_base)
-    found = [_renaming(markers, order, T_given, target_ct) for order in fitting if np.any(order != np.arange(len(x)))]
-    harmful = [renaming for renaming, moved_mm in found if moved_mm > moving_mm]
+    moving = [_renaming(markers, order, T_given, target_ct) for order in fitting if np.any(order != np.arange(len(x)))]
+    harmful = [renaming for renaming, moved_mm in moving if moved_mm > moving_mm]
     return Renamings(tuple(sorted(harmful, key=lambda one: (-one.target_mm, one.touched_as))), complete)
 
 
@@ -224,10 +224,10 @@ SHOWN = 3
 
 def better_names(markers: MarkerPairs, target_ct: Floats, fre_mm: float) -> str:
     """Sentence on permutations of the names that fit where the given ones do not, the best first; empty for none."""
-    found = renamings(markers, target_ct, min(fre_mm / BETTER, MAX_FRE_MM), moving_mm=0.0).found
-    if not found:
+    permuted = renamings(markers, target_ct, min(fre_mm / BETTER, MAX_FRE_MM), moving_mm=0.0).found
+    if not permuted:
         return ""
-    best = sorted(found, key=lambda one: one.fre_mm)
+    best = sorted(permuted, key=lambda one: one.fre_mm)
     more = f" (and {len(best) - SHOWN} more)" if len(best) > SHOWN else ""
     fitting = [f"with {one.slip} they would fit (FRE {one.fre_mm:.2f} mm)" for one in best[:SHOWN]]
     return f"; {', or '.join(fitting)}{more}"

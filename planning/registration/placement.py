@@ -147,8 +147,8 @@ def _aimed(T_base_ct: Floats, points_ct: Floats, points_base: Floats, noise: Rea
     stacked = residuals.reshape(*residuals.shape[:-2], -1, 1)
     step = (aim.response(noise, weights) @ stacked)[..., 0]
     at = (R @ aim.target_ct) + t[..., 0, :]
-    turn = exp_rotation(step[..., 3:])
-    return pose(turn @ R, (turn @ (t[..., 0, :] - at)[..., None])[..., 0] + at + step[..., :3])
+    dR = exp_rotation(step[..., 3:])
+    return pose(dR @ R, (dR @ (t[..., 0, :] - at)[..., None])[..., 0] + at + step[..., :3])
 
 
 def aimed(registration: Registration, aim: Aim) -> Registration:
@@ -240,16 +240,16 @@ def without_each(registration: Registration, target_ct: Floats) -> tuple[Without
     target, residuals = apply(registration.T_base_ct, target_ct), markers.points_base - fitted
     omega, shared = uncertainty.noise.covariance(uncertainty.R_base_ct)
     whole = omega + shared
-    found = []
+    without = []
     for row, name in enumerate(markers.names):
-        kept = np.delete(np.arange(len(markers)), row)
-        axes = (3 * kept[:, None] + np.arange(3)).ravel()
-        A, center = design(fitted[kept], fitted[kept].mean(axis=0)), fitted[kept].mean(axis=0)
+        others = np.delete(np.arange(len(markers)), row)
+        axes = (3 * others[:, None] + np.arange(3)).ravel()
+        A, center = design(fitted[others], fitted[others].mean(axis=0)), fitted[others].mean(axis=0)
         information, X = A.T @ np.linalg.inv(omega[np.ix_(axes, axes)]) @ A, carried(center, target)[:3]
         rms = uncertainty.test.scale * float(np.sqrt(np.trace(X @ np.linalg.inv(information) @ X.T)))
-        test = noise_test(residuals[kept].ravel(), whole[np.ix_(axes, axes)], A)
-        found.append(WithoutMarker(name, rms, test.probability))
-    return tuple(found)
+        test = noise_test(residuals[others].ravel(), whole[np.ix_(axes, axes)], A)
+        without.append(WithoutMarker(name, rms, test.probability))
+    return tuple(without)
 
 
 def one_more(registration: Registration, target_ct: Floats, skin_points_ct: Floats) -> OneMore | None:

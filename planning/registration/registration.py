@@ -391,15 +391,15 @@ def distortion(
     root = np.linalg.inv(np.linalg.cholesky(cov))
     gaps, A = (markers.points_base - fitted).ravel(), design(fitted, fitted.mean(axis=0))
     center_ct = markers.points_ct.mean(axis=0)
-    found = []
+    fitted_kinds = []
     for axes in KINDS:
         moved = _moved(axes, T_base_ct, markers.points_ct - center_ct).ravel()
         tested = lacking(root @ gaps, root @ A, root @ moved[:, None])
         if tested is not None:
-            found.append((tested, axes, moved))
-    if not found:
+            fitted_kinds.append((tested, axes, moved))
+    if not fitted_kinds:
         return None
-    best, axes, moved = min(found, key=lambda one: one[0].probability)
+    best, axes, moved = min(fitted_kinds, key=lambda one: one[0].probability)
     amount, back = float(best.found[0]), np.linalg.pinv(A)
     beside, rigid = (column - A @ (back @ column) for column in (moved, gaps))
     at, at_moved = carried(fitted.mean(axis=0), apply(T_base_ct, target_ct))[:3], target_ct - center_ct
@@ -492,18 +492,18 @@ class Registration(Shown):
     @property
     def flags(self) -> tuple[Finding, ...]:
         """Warnings of what weakens it: conditioning, accepted residuals, an outlier marker, lists of two sizes."""
-        found = list(self.conditioning.flags)
+        flags = list(self.conditioning.flags)
         test = self.residual_test if self.uncertainty is None else self.uncertainty.test
         if not (self.residual_test.explained if self.uncertainty is None else self.uncertainty.test.agrees):
             scaled = self.uncertainty is not None and test.explained
             said = test.text() + ("; all errors are scaled to them" if scaled else "; accepted by the case")
             numbers = {"chi_squared": test.chi_squared}
-            found.append(Finding("residuals_unexplained", Severity.WARNING, said, numbers))
+            flags.append(Finding("residuals_unexplained", Severity.WARNING, said, numbers))
         if (outlier := outlier_marker(self.markers, self.residual_test.declared_fle_mm)) is not None:
-            found.append(outlier.finding())
+            flags.append(outlier.finding())
         if self.distortion is not None and self.distortion.significant:
-            found.append(self.distortion.finding())
-        return tuple(found)
+            flags.append(self.distortion.finding())
+        return tuple(flags)
 
     @cached_property
     def distortion(self) -> Distortion | None:

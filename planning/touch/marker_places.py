@@ -152,23 +152,23 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
         what = f"no {count} places that can be told apart, of {len(skin.points)} beside the windows that can be touched"
         raise NoAnswerError(what, code="no_place")
     order = sorted(chosen, key=lambda row: (-skin.points[row, 2], skin.points[row, 0]))
-    put = skin.of(np.array(order))
+    chosen_skin = skin.of(np.array(order))
     places = []
-    for number, (point, normal) in enumerate(zip(put.points, put.normals, strict=True), start=1):
+    for number, (point, normal) in enumerate(zip(chosen_skin.points, chosen_skin.normals, strict=True), start=1):
         tape = None if case.space is Space.LOCAL else tape_to(anatomy.skin, point, np.asarray(up_axis(case)))
         places.append(MarkerPlace(f"M{number}", point, normal, float(point[2] - case.target_ct[2]), tape))
-    unmet, near = tuple(_unmet(put, case.target_ct)), float(put.to_entry.min())
+    unmet, near = tuple(_unmet(chosen_skin, case.target_ct)), float(chosen_skin.to_entry.min())
     return Proposal(tuple(places), error, case.errors is not None, context.arm_note, near, unmet)
 
 
-def _unmet(put: _Skin, target_ct: Floats) -> Iterator[str]:
-    if (near := put.to_entry.min()) < WINDOW_MM:
+def _unmet(chosen_skin: _Skin, target_ct: Floats) -> Iterator[str]:
+    if (near := chosen_skin.to_entry.min()) < WINDOW_MM:
         yield f"a marker is {near:.0f} mm from an entry, less than {WINDOW_MM:g}: mind the drape"
-    if (far := np.linalg.norm(put.points - target_ct, axis=1).max()) > FAR_MM:
+    if (far := np.linalg.norm(chosen_skin.points - target_ct, axis=1).max()) > FAR_MM:
         yield f"a marker is {far:.0f} mm from the target, more than {FAR_MM:g}: skin moves there on its own"
-    if (gap := pdist(put.points).min()) < APART_MM:
+    if (gap := pdist(chosen_skin.points).min()) < APART_MM:
         yield f"two markers are {gap:.0f} mm apart, less than {APART_MM:g}"
-    if not _told_apart(put.points, target_ct, SLIP_MM):
+    if not _told_apart(chosen_skin.points, target_ct, SLIP_MM):
         within = SLIP_MM * RELAXED[-1][0]
         yield f"put each within {within:.1g} mm of its place: with names swapped they would fit to {SLIP_MM:g} mm"
 
@@ -219,12 +219,12 @@ def _wanted(every: _Skin, case: Case, anatomy: Anatomy, off_mm: float, far_mm: f
 
 def _thinned(points: Floats) -> Ints:
     """Rows of points no nearer to each other than `BETWEEN_PLACES_MM`, `PLACES` at most."""
-    kept: list[int] = []
+    rows: list[int] = []
     for row in range(len(points)):
-        near = not kept or np.linalg.norm(points[kept] - points[row], axis=1).min() >= BETWEEN_PLACES_MM
-        if near and len(kept) < PLACES:
-            kept.append(row)
-    return np.array(kept, dtype=np.int64)
+        near = not rows or np.linalg.norm(points[rows] - points[row], axis=1).min() >= BETWEEN_PLACES_MM
+        if near and len(rows) < PLACES:
+            rows.append(row)
+    return np.array(rows, dtype=np.int64)
 
 
 def _touchable(context: CaseContext, candidates: Candidates, points_ct: Floats) -> Bools:
@@ -253,8 +253,8 @@ def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int, less: floa
             for slot in range(count):
                 others = chosen[:slot] + chosen[slot + 1 :]
                 costs = _errors_mm(each[others].sum(axis=0) + each)
-                found = _first(costs, skin.points, others, target_ct, less)
-                chosen[slot], settled[slot] = (chosen[slot], False) if found is None else (found, True)
+                place = _first(costs, skin.points, others, target_ct, less)
+                chosen[slot], settled[slot] = (chosen[slot], False) if place is None else (place, True)
             if chosen == before:
                 break
         error = float(_errors_mm(each[chosen].sum(axis=0)[None])[0])
@@ -279,8 +279,8 @@ def _first(costs: Floats, every: Floats, others: list[int], target_ct: Floats, l
     gaps = np.linalg.norm(every[:, None] - points, axis=2).min(axis=1)
     apart = (gaps >= APART_MM * less) & np.isfinite(costs)
     rows = [row for row in np.argsort(costs, kind="stable") if apart[row]]
-    told = (one for one in rows[:TRIES] if _told_apart(np.vstack([points, every[one]]), target_ct, SLIP_MM * less))
-    return next((int(row) for row in told), None)
+    distinct = (one for one in rows[:TRIES] if _told_apart(np.vstack([points, every[one]]), target_ct, SLIP_MM * less))
+    return next((int(row) for row in distinct), None)
 
 
 def _told_apart(points: Floats, target_ct: Floats, slip_mm: float) -> bool:

@@ -169,9 +169,9 @@ def registered(context: CaseContext, read: NamedPoints) -> Registration:
     """The registration by touched markers: names, points (N, 3), mm, and joints (N, 6), rad, in any order."""
     placement, case = context.placement, context.case
     assert placement is not None and placement.registration is not None and case.errors is not None
-    found, read = placement.registration.markers, _in_order(context, read)
-    rows = [found.names.index(name) for name in read.names]
-    pairs = MarkerPairs(read.names, found.points_ct[rows], read.points, read.joints)
+    markers, read = placement.registration.markers, _in_order(context, read)
+    rows = [markers.names.index(name) for name in read.names]
+    pairs = MarkerPairs(read.names, markers.points_ct[rows], read.points, read.joints)
     noise = marker_noise(case, case.errors, pairs, where="touched markers")
     method = cast(Method, placement.registration.method)
     fitted = register(pairs, method=method, target_ct=case.target_ct, noise=noise, accept_residuals=True)
@@ -183,11 +183,11 @@ def _task(context: CaseContext, q_insertion: Floats) -> _Task:
     placement = context.placement
     if context.reach is None or placement is None or placement.registration is None or context.case.errors is None:
         refuse("no touches can be planned", context.case.path, ALLOWED, "no_markers")
-    found = placement.registration.markers
-    if len(found) > MOST_MARKERS:
+    markers = placement.registration.markers
+    if len(markers) > MOST_MARKERS:
         allowed = f"at most {MOST_MARKERS}; choose with registration.use"
-        refuse(plural(len(found), "marker"), f"{context.case.path}: registration", allowed, "too_many")
-    believed = MarkerPairs(found.names, found.points_ct, apply(placement.T_base_ct, found.points_ct))
+        refuse(plural(len(markers), "marker"), f"{context.case.path}: registration", allowed, "too_many")
+    believed = MarkerPairs(markers.names, markers.points_ct, apply(placement.T_base_ct, markers.points_ct))
     return _Task(context, believed, cast(Method, placement.registration.method), q_insertion)
 
 

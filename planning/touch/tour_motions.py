@@ -103,12 +103,12 @@ def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Cou
     legs = []
     for start, end in pairwise([len(places) - 1, *order, len(places) - 1]):
         try:
-            found = plan_approach(checker, places[start], places[end], seed=seed, speeds=case.robot.speeds)
+            motion = plan_approach(checker, places[start], places[end], seed=seed, speeds=case.robot.speeds)
         except NoAnswerError as error:
             if end in order:
                 raise NoMotionError(end, str(error), error.code) from error
             raise
-        legs.append(found.trajectory)
+        legs.append(motion.trajectory)
         progress(len(legs), len(places))
     touched = zip(order, legs, strict=False)
     touches = (Touch(stops.names[at], stops.points_base[at], stops.q_touch[at], leg) for at, leg in touched)
@@ -189,9 +189,9 @@ def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
     standoff = whole.contact(line[0], needle_may_touch_patient=False)
     if standoff is not None:
         return f"at the standoff {standoff.body} touches {standoff.other}"
-    found = whole.first_contact(dense_states(whole, line, RESOLUTION_RAD), needle_may_touch_patient=True)
-    if found is not None:
-        return f"{found.contact.body} touches {found.contact.other}"
+    hit = whole.first_contact(dense_states(whole, line, RESOLUTION_RAD), needle_may_touch_patient=True)
+    if hit is not None:
+        return f"{hit.contact.body} touches {hit.contact.other}"
     before = line_to(whole.model, tip_mm, q_touch, STANDOFF_MM, 0.0)
     assert before is not None  # a part of the whole line
     states = dense_states(checkers.blunted, before, RESOLUTION_RAD)

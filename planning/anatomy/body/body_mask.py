@@ -53,9 +53,9 @@ UNSCANNED = (
 
 def measured_hu(hu: NDArray[Any]) -> tuple[NDArray[Any], Bools]:
     """An image (nx, ny, nz), HU, in which no padding counts as body: itself if none is dense; what was not measured."""
-    found = find_unscanned(hu)
-    dense = found & (hu >= NEARLY_AIR_HU)
-    return (np.where(dense, hu.dtype.type(BLANK_HU), hu) if dense.any() else hu), found
+    unscanned = find_unscanned(hu)
+    dense = unscanned & (hu >= NEARLY_AIR_HU)
+    return (np.where(dense, hu.dtype.type(BLANK_HU), hu) if dense.any() else hu), unscanned
 
 
 def find_unscanned(hu: NDArray[Any]) -> Bools:
@@ -64,7 +64,7 @@ def find_unscanned(hu: NDArray[Any]) -> Bools:
     It is far below air; or a slice of one value; or what holds together with a corner of the image by cubes of one
     value. In an image without noise nothing tells such a value from that of air: then it is air.
     """
-    found = np.asarray(hu < UNSCANNED_HU)
+    unscanned = np.asarray(hu < UNSCANNED_HU)
     corners = tuple(slice(None, None, max(1, n - 1)) for n in hu.shape)
     cubes = [hu[cube] for cube in itertools.product((slice(0, 2), slice(-2, None)), repeat=3)]
     for value in {cube.flat[0] for cube in cubes if cube.min() == cube.max() >= UNSCANNED_HU}:
@@ -74,13 +74,13 @@ def find_unscanned(hu: NDArray[Any]) -> Bools:
         at_corners[corners] = True
         if (blocks & at_corners).any() and _measured_air_has_noise(hu, value):
             parts = parts_of(blocks)
-            found |= parts.painted(parts.counts(at_corners) > 0)
-            found |= (found | same).all(axis=2)[:, :, None]  # where a circle touches the image's sides
+            unscanned |= parts.painted(parts.counts(at_corners) > 0)
+            unscanned |= (unscanned | same).all(axis=2)[:, :, None]  # where a circle touches the image's sides
     for z in np.flatnonzero(np.ptp(hu[corners[:2]], axis=(0, 1)) == 0):
         value = hu[0, 0, z]
-        if not found[:, :, z].all() and (hu[:, :, z] == value).all() and _measured_air_has_noise(hu, value):
-            found[:, :, z] = True
-    return found
+        if not unscanned[:, :, z].all() and (hu[:, :, z] == value).all() and _measured_air_has_noise(hu, value):
+            unscanned[:, :, z] = True
+    return unscanned
 
 
 def _measured_air_has_noise(hu: NDArray[Any], value: Any) -> bool:

@@ -105,8 +105,8 @@ def content_of(dense: Bools, T_ct_index: Floats) -> Content:
             next_area = areas[np.clip(k + inward, 0, len(areas) - 1)]
             wide = areas[k] > min(WIDE * next_area, 2.0 * np.pi * ROUND_MM * step_mm)
             ends.append((k, areas[k], _is_thick(dense.take(k, axis=axis), across_mm), wide))
-    found = (np.array(column).reshape(3, 2) for column in zip(*ends, strict=True))
-    return Content((dense.shape[0], dense.shape[1], dense.shape[2]), T_ct_index, *found)
+    columns = (np.array(column).reshape(3, 2) for column in zip(*ends, strict=True))
+    return Content((dense.shape[0], dense.shape[1], dense.shape[2]), T_ct_index, *columns)
 
 
 def _is_thick(section: Bools, spacing_mm: Floats) -> bool:
@@ -128,12 +128,12 @@ def cut_ends(content: Content, organs: Iterable[tuple[TriangleMesh, float]], *, 
     filled = content.thick & (content.beyond > 0)
     across_bed = np.array([[False], [False], [not whole]])
     cut = filled & across_bed & content.wide
-    found = list(organs) if (filled & ~cut).any() else []
+    inside = list(organs) if (filled & ~cut).any() else []
     for axis, end in np.argwhere(filled & ~cut):
         sides = [axis, end], [axis, 1 - end]
         cut[axis, end] = any(
             _ends_flat(content, organ, *sides[0]) and not (whole and _ends_flat(content, organ, *sides[1]))
-            for organ in found
+            for organ in inside
         )
     alike = (content.beyond > 0) & np.isin(content.beyond, content.beyond[cut])
     return np.asarray(cut if whole else cut | alike)

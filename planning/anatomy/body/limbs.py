@@ -77,8 +77,8 @@ class LimbSearch(NamedTuple):
         pieces = self.pieces(int(self.parts[at]))
         own_ml = max((piece.ml for piece in pieces if piece.whole[at]), default=0.0)
         none = (piece.near[at] or min(own_ml, piece.ml) > MOST_ML for piece in pieces)
-        found = (0 if no else 2 - int(piece.whole[at]) for no, piece in zip(none, pieces, strict=True))
-        return int(self.parts[at]), *found
+        answers = (0 if no else 2 - int(piece.whole[at]) for no, piece in zip(none, pieces, strict=True))
+        return int(self.parts[at]), *answers
 
     def limbs(self, chosen: Sequence[int]) -> Bools:
         """Blocks of the body that belong to a limb without the target, by what was `chosen` for it."""

@@ -175,10 +175,10 @@ def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face
         values, out = np.moveaxis(hu, axis, 0), 1 if end else -1
         known = (at >= 0) & (at != (len(values) - 1 if end else 0))
         at = np.where(known, at, 1)
-        within, beside = (np.take_along_axis(values, k[None], axis=0)[0] - float(level) for k in (at, at + out))
-        crossed = known & (within > 0.0) & (beside < 0.0)
-        share = np.divide(within, within - beside, out=np.full(within.shape, 0.5), where=crossed)
-        surfaces[axis, end] = np.where(known, at + out * share, np.nan)
+        within, outside = (np.take_along_axis(values, k[None], axis=0)[0] - float(level) for k in (at, at + out))
+        crossed = known & (within > 0.0) & (outside < 0.0)
+        fraction = np.divide(within, within - outside, out=np.full(within.shape, 0.5), where=crossed)
+        surfaces[axis, end] = np.where(known, at + out * fraction, np.nan)
     return surfaces
 
 
@@ -191,12 +191,12 @@ def drawn_sides(
     """
     if body.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
         return ()
-    found, middle = list[TableSide | None](), middle_of(body)
+    sides, middle = list[TableSide | None](), middle_of(body)
     for face, ends in surfaces.items():
         side_of = partial(_side, face, ends, spacing_mm, middle, touching)
         parts = map(side_of, _parts(ends, spacing_mm[face[0]], spacing_mm[1 - face[0]], float(spacing_mm[2])))
-        found.append(side_of() or max(filter(None, parts), key=lambda side: side.width_mm, default=None))
-    return tuple(filter(None, found))
+        sides.append(side_of() or max(filter(None, parts), key=lambda side: side.width_mm, default=None))
+    return tuple(filter(None, sides))
 
 
 def _side(

@@ -155,18 +155,18 @@ def _held_against_markers(
     case: Case, registration: Registration, given: Reading, fitting: Sequence[Reading]
 ) -> Finding:
     """How far the transform is from what the markers say: a warning where their errors do not explain it."""
-    found = _apart(case, registration, given.T_base_ct)
+    apart = _apart(case, registration, given.T_base_ct)
     said = (
-        f"the markers put {found.where} {found.apart_mm:.1f} mm from its position by the stated transform; expected "
-        f"from the markers there: {found.expected_mm:.1f} mm (rms)"
+        f"the markers put {apart.where} {apart.apart_mm:.1f} mm from its position by the stated transform; expected "
+        f"from the markers there: {apart.expected_mm:.1f} mm (rms)"
     )
-    if found.contradicts:
+    if apart.contradicts:
         _refuse(case, f"{said}: {CAUSES}{''.join(f'; with {one.keys} they agree' for one in fitting)}")
-    unexplained = found.apart_mm > EXPLAINED * found.expected_mm
-    doubt = ", more than their errors explain" if unexplained else ""
-    said = f"registration: stated transform: {said}{doubt}; the transform's own expected error is unknown"
+    unexplained = apart.apart_mm > EXPLAINED * apart.expected_mm
+    remark = ", more than their errors explain" if unexplained else ""
+    said = f"registration: stated transform: {said}{remark}; the transform's own expected error is unknown"
     severity = Severity.WARNING if unexplained else Severity.NOTE
-    return Finding("transform_and_markers", severity, said, {"apart_mm": found.apart_mm})
+    return Finding("transform_and_markers", severity, said, {"apart_mm": apart.apart_mm})
 
 
 class Apart(NamedTuple):

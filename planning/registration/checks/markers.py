@@ -380,14 +380,14 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[
     that.
     """
     test, where = registration.residual_test, f"{case.path}: registration"
-    found, complete = renamings(registration.markers, case.target_ct, test.alike_mm)
-    better = [one for one in found if test.contradicted_by(one.fre_mm)]
+    permuted, complete = renamings(registration.markers, case.target_ct, test.alike_mm)
+    better = [one for one in permuted if test.contradicted_by(one.fre_mm)]
     given = f"as named, FRE is {test.fre_mm:.2f} mm"
     if better:
         what = f"the marker names look permuted: {min(better, key=lambda one: one.fre_mm).text()}; {given}"
         refuse(what, where, "the names in the order of the touches", "markers_permuted")
-    excluded = [place_excluded(case, skin.mesh, one.T_base_ct) for one in found]
-    possible = [one for one, why in zip(found, excluded, strict=True) if not why]
+    excluded = [place_excluded(case, skin.mesh, one.T_base_ct) for one in permuted]
+    possible = [one for one, why in zip(permuted, excluded, strict=True) if not why]
     stated = case.registration or case.robot.stated
     if possible and not (stated is not None and stated.accept_symmetry):
         what = f"swapped marker names would go unnoticed: {_worst(possible)}; {given}"
@@ -402,15 +402,15 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[
     if possible:
         said = f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}"
         yield Finding("marker_names_alike", Severity.WARNING, said)
-    elif found:
-        said = f"marker names: {_worst(found)}; excluded only because then {excluded[0]}"
+    elif permuted:
+        said = f"marker names: {_worst(permuted)}; excluded only because then {excluded[0]}"
         yield Finding("marker_names_alike", Severity.WARNING, said)
 
 
-def _worst(found: Sequence[Renaming]) -> str:
+def _worst(permuted: Sequence[Renaming]) -> str:
     """The first, which puts the target farthest away, and how many more there are."""
-    more = len(found) - 1
-    return found[0].text() + (f" (and {plural(more, 'more permutation')})" if more else "")
+    more = len(permuted) - 1
+    return permuted[0].text() + (f" (and {plural(more, 'more permutation')})" if more else "")
 
 
 HALF_TURNS: Mapping[str, Signs] = {
