@@ -241,7 +241,7 @@ CELLS, OWN_TARGET = 24, "target.hit_radius_mm"
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """What a needle must be checked against, and what could not be known."""
+    """All solids that a needle is checked against, and the warnings on what could not be known."""
 
     structures: tuple[Structure, ...]
     """All structures of the body but the skin; the CT's unnamed dense components and gas among them."""
@@ -255,7 +255,7 @@ class Anatomy:
     couch: TriangleMesh | None = None
     """What lies beyond what the body lies on in the CT, or None where no CT shows it."""
     findings: tuple[Finding, ...] = ()
-    """The warnings again, and what is said besides, with code and numbers."""
+    """The warnings and further findings, with code and numbers."""
 
     @property
     def checked(self) -> tuple[Structure, ...]:

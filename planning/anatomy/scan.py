@@ -263,7 +263,7 @@ dense counts as body. Beyond, it is outside, as an arm is that the skin lacks.""
 
 
 class Outside(NamedTuple):
-    """What a CT shows outside of the body."""
+    """Surfaces of objects that a CT shows outside of the body."""
 
     mesh: TriangleMesh | None
     """The surface of what is not known to be free, LPS mm; None for air alone."""

@@ -37,7 +37,7 @@ class Skin:
     cut_faces: NDArray[np.bool_]
     """Shape (m,), triangles that are not skin: there the field of view ends, and the body goes on."""
     field_of_view: FieldOfView | None
-    """What was imaged, or None for a mesh that says nothing of that."""
+    """The imaged box; None for a mesh, which states none."""
     warnings: tuple[str, ...]
 
     def __post_init__(self) -> None:

@@ -36,7 +36,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 Value = TypeVar("Value")
 
 ENDS = ("last", "area_mm2", "thick", "wide")
-"""Of `Content`, by axis and end."""
+"""Fields of `Content` that have a value by axis and end."""
 READERS = "puncture_twin.planning.case.named_files"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
@@ -219,7 +219,7 @@ class Imaged:
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
     ) -> Value:
-        """See `VolumeSurfaces.kept`."""
+        """A value made from this image, cached; see `VolumeSurfaces.kept`."""
         return self.surfaces.kept({"box": self.box, "shown": asdict(self.shown), **made_from}, make, read, by=by)
 
 

@@ -35,7 +35,7 @@ from puncture_twin.planning.geometry.rigid import apply, pose
 
 BEYOND_IMAGE = "beyond_image"
 BEYOND_LABELS = "beyond_labels"
-"""Their names among the structures."""
+"""Names of these solids among the structures."""
 REACH_MM, ASIDE_MM = 2000.0, 400.0
 """So far the body goes on along the bed, and half spaces to their sides: farther than a needle and its arm reach. And
 beyond a face that cuts its side: no trunk is wider than 800 mm."""
@@ -181,7 +181,7 @@ def _outline(points: Floats, wider_mm: float) -> Floats:
 
 
 def prism(T_ct_box: Floats, outline: Floats, axis: int, between: tuple[float, float]) -> TriangleMesh:
-    """What stands over a convex polygon, shape (n, 2), between two planes across an axis, seen from outside; mm."""
+    """Prism over a convex polygon, shape (n, 2), between two planes across an axis, faces outward; mm."""
     n = len(outline)
     index = np.concatenate([np.insert(outline, axis, at, axis=1) for at in between])
     i, j = np.arange(n), np.roll(np.arange(n), -1)

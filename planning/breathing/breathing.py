@@ -46,7 +46,7 @@ class Breathing:
         return np.asarray(s <= (1.0 if self.gate is None else self.gate))
 
     def moved_ct(self, s: float, weight: float = 1.0) -> Floats:
-        """Displacement of something of a weight from where the CT shows it, at a position s; shape (3,), mm."""
+        """Displacement at a position s, times a weight, from where the CT shows it; shape (3,), mm."""
         return np.asarray((s - self.scanned_at) * weight * self.amplitude_mm * self.direction_ct)
 
     @property
@@ -59,7 +59,7 @@ class Breathing:
         return np.asarray(self.amplitude_mm * np.outer(self.direction_ct, both))
 
     def phase_text(self, s: float) -> str:
-        """A position for people."""
+        """A position of the breath, in words."""
         return f"s = {s:.2f}, {s * self.amplitude_mm:.1f} mm from exhale"
 
     @property
@@ -78,7 +78,7 @@ class Breathing:
 
 
 SAME = 12
-"""Digits to which two positions are one: breathing in and out pass the same places, but for rounding."""
+"""Digits to which two positions count as one: breathing in and out pass the same places, but for rounding."""
 
 
 def positions(phases: int, exponent: int) -> Floats:

@@ -34,7 +34,7 @@ ALLOWED_CASE = "a TOML case file with schema = 2, or a folder with case.toml"
 
 @dataclass(frozen=True, eq=False)
 class Case(Shown):
-    """What a search, a plan and a rehearsal start from. A `Case` has been validated."""
+    """A validated case: what a search, a plan and a rehearsal start from."""
 
     path: Path
     name: str
@@ -67,7 +67,7 @@ class Case(Shown):
     hit_radius_mm: float | None = None
     """Within which of the target the tip hits; None counts the target's own mesh."""
     errors: ErrorModel | None = None
-    """What is declared to err; None, as of all that follows, where the case does not say."""
+    """Declared errors; None, here and below, where the case does not state them."""
     truth_errors: ErrorModel | None = None
     """From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`."""
     breathing: Breathing | None = None
@@ -80,9 +80,9 @@ class Case(Shown):
     """Whether the target lies in no structure: its own is then the ball of the hit radius about it, which has its
     name."""
     tool: ToolBody | None = None
-    """What the flange carries beside needle and holder."""
+    """A body on the flange besides needle and holder."""
     options: CaseOptions = NO_OPTIONS
-    """What is stated in place of what the case file states."""
+    """Options that replace values of the case file."""
 
     @brief
     def __repr__(self) -> str:
@@ -117,7 +117,7 @@ class Case(Shown):
         yield from (("warning", warning) for warning in self.warnings)
 
     def replace(self, *, target_ct: ArrayLike | None = None, **options: Mapping[str, Any]) -> Case:
-        """What the case would be if its file had these values; the file stays as it is.
+        """The case with these values in place of its file's; the file stays as it is.
 
         Args:
             target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame). Alone, it

@@ -180,11 +180,11 @@ def case_schema() -> dict[str, Any]:
 
 
 OPTIONS_ROLE = "options"
-"""Of the input that options are."""
+"""Role of the options among the inputs of a case."""
 TABLES = {"target": "target", "needle": "needle", "arm": "robot", "errors": "errors", "search": "search"}
 """Options that are laid over a table of the case, key by key, and that table."""
 MOUNT, MARGINS, ADDED = "mount", "margins", "add_mm"
-"""Options that are more than that, and the key of `margins` that adds to all."""
+"""Options that are more than an overlay of a table, and the key of `margins` that adds to all margins."""
 SECTIONS = (*TABLES, MARGINS, MOUNT)
 """Every kind of option."""
 ALTERNATIVES = (

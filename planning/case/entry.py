@@ -176,7 +176,7 @@ class AngleGrid:
         return np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])
 
     def beyond(self) -> tuple[Floats, Floats]:
-        """Directions (θ, β) one step outside of the grid, which nobody has asked about, shape (b,) each."""
+        """Directions (θ, β) one step outside of the grid, which were not searched, shape (b,) each."""
         none, polar = np.empty(0), [self.theta[0] - self.step, self.theta[-1] + self.step]
         beyond = [self.theta[0] > SAME_ANGLE, self.theta[-1] < np.pi - SAME_ANGLE]
         azimuths = none if self.full_circle else np.array([self.beta[0] - self.step, self.beta[-1] + self.step])

@@ -63,22 +63,22 @@ class ArmErrors(Section):
 
     @property
     def twist(self) -> float:
-        """Of every twist, rad."""
+        """Standard deviation of every link's twist, rad."""
         return float(np.radians(self.twist_deg))
 
     @property
     def joint(self) -> float:
-        """Of every joint's zero, rad."""
+        """Standard deviation of every joint's zero, rad."""
         return float(np.radians(self.joint_deg))
 
     @property
     def backlash(self) -> float:
-        """Width of the play, rad."""
+        """Full width of every joint's play, rad."""
         return float(np.radians(self.backlash_deg))
 
     @property
     def repeatability(self) -> float:
-        """Of every arrival, rad."""
+        """Standard deviation of every joint at each arrival, rad."""
         return float(np.radians(self.repeatability_deg))
 
     def scaled(self, factor: float) -> Self:
@@ -103,7 +103,7 @@ class ArmUncertainty:
 
     @property
     def arriving(self) -> float:
-        """Of every joint at one moment after one arrival: repeatability and jitter, rad."""
+        """Standard deviation of every joint at one moment after an arrival: repeatability and jitter, rad."""
         return float(np.hypot(self.repeatability, self.jitter))
 
     def scaled(self, factor: float) -> ArmUncertainty:
@@ -117,7 +117,7 @@ class ErrorModel:
 
     marker_cov_ct: Floats  # shape (3, 3), mm^2: of one marker read in the CT
     touch_mm: float
-    """Of one touch, per axis of the base frame, besides the arm."""
+    """Standard deviation of one touch, per axis of the base frame, besides the arm's errors."""
     target_cov_ct: Floats  # shape (3, 3), mm^2: of the target read in the CT
     arm: ArmUncertainty
     surface_mm: float | None
@@ -126,7 +126,7 @@ class ErrorModel:
     found: bool = False
     """Whether the markers' residuals give the size of all errors, and the declaration their shape."""
     size: float = 1.0
-    """By which factor all that was declared has been scaled."""
+    """Factor by which all declared deviations have been scaled."""
 
     def __post_init__(self) -> None:
         for name in ("marker_cov_ct", "target_cov_ct"):

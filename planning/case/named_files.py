@@ -108,7 +108,7 @@ def _masks(content: CaseFile, path: Path, single: Sequence[NamedFile]) -> Iterat
 
 
 VOLUME_ROLES = ("labelmap", "ct")
-"""What a volume is to a case; a file that it needs beside it is its ``data``."""
+"""Roles of volumes in a case; a file of voxels beside a header has the role with ``data`` behind it."""
 
 
 class CaseVolumes:

@@ -54,7 +54,7 @@ class Needle:
         return self.diameter_mm / 2
 
     def of_length(self, length_mm: float) -> Needle:
-        """A needle of the same kind: the same holder, and a shaft that is as much shorter or longer."""
+        """This needle with another length: the same holder, a shaft that is shorter or longer by the difference."""
         return replace(self, length_mm=length_mm, shaft_mm=self.shaft_mm + length_mm - self.length_mm)
 
     @property
@@ -277,7 +277,7 @@ def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
 
 
 URDF_ROLE, MESH_ROLE = "urdf", "urdf mesh"
-"""Of the files that decide an arm."""
+"""Roles of the files that define an arm, among the inputs of a case."""
 
 
 def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
@@ -358,7 +358,7 @@ def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
 
 
 SAME_MM = 0.03
-"""By which ``diameter_mm`` may differ from its gauge: twice the usual tolerance of the chart."""
+"""Greatest difference of ``diameter_mm`` from its gauge: twice the usual tolerance of the chart."""
 
 
 def bending_of(

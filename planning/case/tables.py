@@ -66,7 +66,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     def _problems(self) -> Iterator[SchemaError]:
-        """What is wrong with the keys together; the first is raised."""
+        """Problems of the keys together; the first is raised."""
         yield from ()
 
     def model_post_init(self, context: Any, /) -> None:
@@ -91,7 +91,7 @@ MAX_STRUCTURES, MAX_LABEL_MAPS = 1000, 100
 """Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree. And tables
 ``[[structures]]``, each with a label map of its own."""
 Stated = Literal["none", "present"]
-"""What a person says of arms, or of a table, in an image."""
+"""Whether arms, or a table, are in an image, as a person states it."""
 Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
 Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
 Margins = Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)]
@@ -192,7 +192,7 @@ class CtSection(Section):
 
 
 Chance = Annotated[Number, Field(ge=0, le=1)]
-"""Or another fraction."""
+"""A chance, or another fraction, 0..1."""
 MAX_DIRECTIONS = 1_000_000
 """Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
 
@@ -632,7 +632,7 @@ class GantrySection(Section):
 
 
 TOOL_ROLE = "tool mesh"
-"""Of the file that decides a tool."""
+"""Role of the file that defines a tool, among the inputs of a case."""
 Beside = Annotated[Number, Field(ge=-1000, le=1000)]
 ToolTurn = Annotated[Number, Field(ge=-360, le=360)]
 

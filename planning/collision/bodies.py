@@ -45,7 +45,7 @@ class Contact(NamedTuple):
 
 
 NEEDLE_IN_PATIENT = Contact("needle", PATIENT)
-"""What may happen while the needle goes in."""
+"""The contact that is allowed while the needle goes in."""
 
 
 class FirstContact(NamedTuple):
@@ -109,7 +109,7 @@ def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Float
 
 
 SLACK_MM = 1e-6
-"""Every sphere is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
+"""Prisms and spheres are larger by this, which covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
 
 
 class Shape(NamedTuple):
@@ -123,7 +123,7 @@ class Shape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One body of the arm."""
+    """A body of the arm: a link, the tool, the holder or the needle."""
 
     name: str  # one of ``BODY_NAMES``
     frame: int  # index of its frame among ``link_poses``
@@ -224,7 +224,7 @@ class Solid:
         return fcl.CollisionObject(self._make(), self.pose)
 
     def place(self, pose: fcl.Transform) -> None:
-        """Move it."""
+        """Move the shape and its FCL object."""
         self.pose = pose
         if "made" in self.__dict__:
             self.made.setTransform(pose)
@@ -236,7 +236,7 @@ def touch(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:
 
 
 def surface(mesh: TriangleMesh) -> fcl.BVHModel:
-    """A surface without an inside."""
+    """An FCL model of a surface, without an inside."""
     bvh = fcl.BVHModel()
     bvh.beginModel(len(mesh.vertices), len(mesh.faces))
     bvh.addSubModel(np.array(mesh.vertices), np.array(mesh.faces))
@@ -245,7 +245,7 @@ def surface(mesh: TriangleMesh) -> fcl.BVHModel:
 
 
 def convex(mesh: TriangleMesh) -> fcl.Convex:
-    """A convex mesh as a solid."""
+    """An FCL model of a convex mesh, solid."""
     counted = np.insert(mesh.faces, 0, 3, axis=1)  # FCL wants each face's corner count before its indices
     return fcl.Convex(np.array(mesh.vertices), len(mesh.faces), counted.ravel().astype(np.int32))
 

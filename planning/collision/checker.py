@@ -460,7 +460,7 @@ def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
 
 
 CARRIERS = ("wrist_3", "holder", "needle")
-"""What a tool is bolted to."""
+"""Bodies that a tool may be bolted to."""
 
 
 def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:

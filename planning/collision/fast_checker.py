@@ -165,10 +165,10 @@ class FastChecker(CellChecker):
 LOOK_FIRST_RAD = 0.125
 """Down to parts of this length a segment is halved for all checks together: what it touches is found soonest so."""
 FINE_MM = 1.0
-"""A state answers for a part of a segment within which no body moves farther from it. So states that were checked are
-no more than 2 mm of motion apart, which with 1 mm of padding proves the path between them; see :class:`CellChecker`."""
+"""A checked state stands for the part of a segment within which no body moves farther from it. So checked states are no
+more than 2 mm of motion apart, which with 1 mm of padding proves the path between them; see :class:`CellChecker`."""
 QUESTIONS = 256
-"""Space for the queries that one segment leaves to FCL, at first."""
+"""Initial space for the queries that one segment leaves to FCL."""
 
 
 class SegmentChecker:

@@ -38,7 +38,7 @@ from puncture_twin.planning.geometry.rigid import apply, even_directions
 from puncture_twin.planning.geometry.triangle_distance import farthest_from
 
 NO_BOX = -1.0
-"""Half sizes of what is no box."""
+"""Half sizes of a hull that is not a box."""
 ROUND = ("holder", "needle")
 """Bodies that are cylinders: their hulls are prisms about them."""
 INSIDE = 1e-5
@@ -66,7 +66,7 @@ LEAF_RADIUS_MM = 30.0
 
 
 class BoundingSphere(NamedTuple):
-    """A sphere, mm."""
+    """Centre and radius of a sphere, mm."""
 
     centre: Floats
     radius: float
@@ -415,7 +415,7 @@ MOST_CELLS = 4_000_000
 
 
 def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache) -> SkinTree:
-    """The tree of skin and what the CT shows behind it, and a field of which nothing is known yet; or empty ones."""
+    """The tree of the skin and the solids outside it, with an empty field of distances; empty without a patient."""
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
         return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3), np.zeros((1, 1), np.bool_))

@@ -24,7 +24,7 @@ DIGIT, LEAST_DIGIT_MM, CHANCE_DIGIT, DIGIT_SQUARE_DEG = 0.1, 0.01, 0.01, 1.0
 """Steps of rewritten numbers: a fraction of a tolerance, which keeps the rest; of a least clearance, mm; of a chance
 (relative); and of an area."""
 MOST_SHOWN = 6
-"""Windows."""
+"""Windows that a message lists at most."""
 
 
 def direction_finding(check: checks_file.CheckSection, explanation: Explanation) -> Finding:
@@ -126,7 +126,7 @@ ONLY_NUMBERS = f"{runs.UPDATE} rewrites only numbers: change verdict, reason, st
 
 
 class CollisionMismatchError(AssertionError):
-    """Something is not what the file expects."""
+    """A result that differs from what the file expects."""
 
 
 @dataclass(frozen=True)

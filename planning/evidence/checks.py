@@ -30,7 +30,7 @@ STEP_SLACK = 1e-9
 
 
 def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache = NO_CACHE) -> tuple[Finding, ...]:
-    """Hold the inputs of a case against each other, and warnings and notes in the order in which they are shown.
+    """Warnings and notes from comparing the inputs of a case with each other, in the order in which they are shown.
 
     Raises InputError: Everything that is refused, in one line; its code and numbers are those of the first.
     """
@@ -65,7 +65,7 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
 
 
 def declared(case: Case) -> Iterator[Finding]:
-    """What a person states of the image: no rule guesses it, and every result repeats it."""
+    """Warnings that repeat what a person states of the image, since no rule checks it."""
     for sentence in case.ct.declared:
         yield Finding("declared", Severity.WARNING, sentence)
 
@@ -85,7 +85,7 @@ def _refuse(case: Case, reported: Sequence[Finding]) -> None:
 
 
 def markers(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> Iterator[Finding]:
-    """What weakens the markers, or the stated transform, and what they leave open; see `placement_findings`."""
+    """Warnings on the markers or the stated transform; see `placement_findings`."""
     if placement is None:
         return
     if placement.registration is not None:
@@ -118,7 +118,7 @@ def thick_slices(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
 
 
 def short_grid(case: Case) -> Iterator[Finding]:
-    """Ranges that the step does not divide: the grid ends before they do."""
+    """Warnings on ranges of angles that the step does not divide: the grid ends before they do."""
     step = float(np.degrees(case.search.step))
     for key, limits in (("theta_deg", case.search.theta), ("beta_deg", case.search.beta)):
         low, high = np.degrees(limits).round(9)
@@ -132,7 +132,7 @@ def short_grid(case: Case) -> Iterator[Finding]:
 
 
 def ignored_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
-    """What the case leaves out on purpose, though its name is that of something to be avoided: it counts as free."""
+    """A warning on ignored structures whose names are those of organs to be avoided: they count as free."""
     roles = {name: default_role(name, case.region or "other") for name in anatomy.ignored}
     avoided = [name for name, role in roles.items() if role is not None and role.kind == "avoid"]
     if avoided:
@@ -141,7 +141,7 @@ def ignored_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
 
 
 def absent_usual_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
-    """The usual organs of the case's region that nobody named: they count as free."""
+    """A warning on usual organs of the case's region that no structure names: they count as free."""
     absent = absent_organs(case.region, [*(structure.name for structure in anatomy.structures), *anatomy.ignored])
     if absent:
         said = f"no structure is named like {', '.join(absent)}; organs without a structure count as free"

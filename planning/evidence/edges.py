@@ -160,7 +160,7 @@ class Sample:
         return Sample(self.points_ct[rows], self.normals_ct[rows], self.structure[rows], self.patch[rows])
 
     def moved(self, T: Floats) -> Sample:
-        """The same surfaces elsewhere, by a map (4, 4)."""
+        """The sample moved by a map (4, 4)."""
         return Sample(*self.placed(T), self.structure, self.patch)
 
     def placed(self, T: Floats) -> tuple[Floats, Floats]:
@@ -183,7 +183,7 @@ def sample_surfaces(meshes: Sequence[TriangleMesh], count: int = POINTS) -> Samp
 
 
 def shifts(axes: Floats, voxel_mm: Floats, most_mm: Floats | float = MOST_SHIFT_MM) -> Iterator[Placement]:
-    """Moved along each axis (unit columns (3, 3)), doubling from the least shift that counts.
+    """Shifts along each axis (unit columns (3, 3)), doubling from the least shift that counts.
 
     Voxels (3,) are the coarser ones of image and labels along these axes, the largest shift is one of all axes or of
     each (3,); the least is tried whatever it is.
@@ -205,19 +205,19 @@ def least_shift_mm(voxel_mm: Floats) -> Floats:
 
 
 def scalings(about: Sequence[Floats], factors: Sequence[float] = SCALES, kind: str = "scale") -> Iterator[Placement]:
-    """Made larger and smaller about points (3,)."""
+    """Scalings, larger and smaller, about points (3,)."""
     for point, factor in itertools.product(about, factors):
         yield Placement(kind, _about(point, np.eye(3) * factor))
 
 
 def turns(about: Floats, axes: Floats) -> Iterator[Placement]:
-    """Turned about each axis (unit columns (3, 3)) through a point (3,)."""
+    """Rotations about each axis (unit columns (3, 3)) through a point (3,)."""
     for axis, angle in itertools.product(axes.T, TURNS):
         yield Placement("turn", _about(about, exp_rotation(axis * angle)))
 
 
 def axis_slips(about: Sequence[Floats], axes: Floats) -> Iterator[Placement]:
-    """Every other way to name and to direct three axes (unit columns (3, 3)) about points (3,).
+    """Every other order and sense of three axes (unit columns (3, 3)) about points (3,).
 
     Of the patient or a grid: mirror images, half and quarter turns, arrays reversed.
     """

@@ -38,9 +38,9 @@ TUBES = (VESSEL_WORDS - {"aorta"}) | words("""
     nerve nerves cord canal duct ducts bronchus bronchi trachea airway airways portal urethra ureter catheter stent
     electrode implant cava
 """)
-"""What runs into organs; but for the cord not into bones."""
+"""Words of tubes, which run into organs; but for the cord not into bones."""
 TISSUES = words("fat muscle muscles tissue cavity compartment mediastinum peritoneum")
-"""What other structures are parts of, or lie in."""
+"""Words of tissues that other structures are parts of, or lie in."""
 
 COMPACT = frozenset(
     (
@@ -257,7 +257,7 @@ def _beyond_cut(points: Floats, view: FieldOfView | None, tolerance_mm: Floats) 
 
 
 def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding]:
-    """An organ that is elsewhere protects nothing; what is `unknown`, or a ball about the target, may lie anywhere."""
+    """Findings on organs outside the skin, but for `unknown` ones and the target's own ball, which may lie there."""
     known = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
     placed = [structure for structure in known if structure.source != OWN_TARGET]
     elsewhere = [structure for structure in placed if _wholly_outside(anatomy.skin, structure)]

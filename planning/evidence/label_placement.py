@@ -116,7 +116,7 @@ class Source:
 
 
 class Assessed(NamedTuple):
-    """What the edges say of one source."""
+    """Result of the edge test for one source."""
 
     z: float
     """The largest over all placements that were tried; -inf where the image shows none of the surfaces."""
@@ -229,7 +229,7 @@ class Alone(NamedTuple):
         return np.asarray(on_edges & (self.uneven < uneven))
 
     def names_of(self, rows: Bools) -> tuple[str, ...]:
-        """Of some structures (n,)."""
+        """Names of some structures, by a mask (n,)."""
         return tuple(name for name, one in zip(self.names, rows, strict=True) if one)
 
     def anywhere(self, limits: Sequence[tuple[float, float, float]]) -> tuple[str, ...]:
@@ -391,7 +391,7 @@ class Slip(NamedTuple):
 
 
 def slip_of(T: Floats, middle_ct: Floats) -> Slip:
-    """What a placement (4, 4) does to surfaces about a point (3,), LPS mm."""
+    """Shift, rotation and scale of a placement (4, 4) about a point (3,), LPS mm."""
     linear, exchanged = T[:3, :3], np.zeros((3, 3))
     scale = float(np.cbrt(abs(np.linalg.det(linear))))
     order = np.abs(linear).argmax(axis=0)

@@ -107,9 +107,9 @@ def _readings(point_ct: Floats, space: Space) -> Iterator[tuple[str, Floats]]:
 
 
 def target_in_vessel(case: Case) -> Iterator[Finding]:
-    """That the target is a vessel or the like: its structure is not avoided, so paths that end in it are safe.
+    """A warning where the target is a vessel or the like: it is then not avoided, so paths that end in it are safe.
 
-    And that its name is not wholly known: a ``Tumorvene`` is a vessel, a lesion's by a part of its name alone, and an
+    Or where its name is not wholly known: a ``Tumorvene`` is a vessel, a lesion's by a part of its name alone, and an
     ``AAA`` is an aneurysm. In a phantom any name is usual.
     """
     if case.own_target:
@@ -128,7 +128,7 @@ def target_in_vessel(case: Case) -> Iterator[Finding]:
 
 
 def target_in_other_space(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
-    """That the target lies in a lesion in the other space and in none here; or in an organ, and here in nothing.
+    """A warning where the target, read in the other space, lies in a lesion or organ, and as stated in none.
 
     Nothing is refused: a lesion that nobody drew is a target as well, and its mirror image may lie in another one.
     """
@@ -157,7 +157,7 @@ def _holders(anatomy: Anatomy, point_ct: Floats) -> Iterator[str]:
 
 
 def open_around_target(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
-    """Of an open surface the inside is not known; but one that goes more than half around the target is refused.
+    """Refusals of open surfaces that go more than half around the target: their inside is not known.
 
     Two numbers tell: rays from the target say it however the triangles are wound, and the winding number says it of
     shells in shells, which a ray leaves an even number of times. Neither is the inside, so none is claimed.

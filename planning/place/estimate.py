@@ -89,7 +89,7 @@ class Surroundings(NamedTuple):
 
     @property
     def compiled(self) -> tuple[tuple[Floats, ...], ...]:
-        """As compiled code takes them: plain tuples."""
+        """The surroundings as plain tuples, for compiled code."""
         return tuple(self.skin), tuple(self.fixed), tuple(self.carried)
 
 
@@ -119,7 +119,7 @@ def base_is_clear(spheres: ArmSpheres, surroundings: Surroundings, T_ct_base: Fl
 
 @nb.njit(cache=True)
 def _moved(T, x, y, z):
-    """A point where the frame ``T`` (4, 4) takes it."""
+    """A point mapped by the frame ``T`` (4, 4)."""
     a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
     b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
     c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]

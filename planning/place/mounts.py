@@ -180,7 +180,7 @@ class WantedDirections:
         return len(self.weight)
 
     def only(self, rows: NDArray[np.bool_]) -> WantedDirections:
-        """Some of them, with their weights."""
+        """Some of the directions, with their weights."""
         return WantedDirections(self.outward_ct[rows], self.standoff_mm[rows], self.weight[rows])
 
     def order(self, count: int) -> NDArray[np.int64]:
@@ -194,7 +194,7 @@ class WantedDirections:
         return np.concatenate([chosen, np.setdiff1d(np.arange(len(self)), chosen)])
 
     def standing_for_all(self, rows: NDArray[np.int64]) -> WantedDirections:
-        """Some of them, each weighted by all that are nearest to it."""
+        """Some of the directions, each weighted by all that are nearest to it."""
         nearest = np.argmax(self.outward_ct @ self.outward_ct[rows].T, axis=1)
         weight = np.bincount(nearest, self.weight, minlength=len(rows)).astype(np.float64)
         return WantedDirections(self.outward_ct[rows], self.standoff_mm[rows], weight)

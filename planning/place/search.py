@@ -132,7 +132,7 @@ class PlacementCheck:
     tool: Tool
     skin: TriangleMesh
     outside: TriangleMesh | None
-    """What the CT shows outside of the skin, or None; CT frame, as the skin."""
+    """Surface of objects outside of the skin, or None; CT frame, as the skin."""
     fixed: tuple[Box, ...]
     """Boxes that stand with the patient; their ``T_base_box`` is in the CT frame."""
     carried: tuple[Box, ...]  # boxes that stand with the arm, base frame
@@ -250,7 +250,7 @@ class PlaceSearch(Shown):
 
     @property
     def every(self) -> tuple[RatedPlacement, ...]:
-        """All that were rated, the case's own last."""
+        """All rated placements, the case's own last."""
         return self.rated if self.own is None else (*self.rated, self.own)
 
     @property
@@ -372,7 +372,7 @@ class _Contender:
 
 
 Work = Callable[..., Iterable[Checked]]
-"""As ``map`` does it."""
+"""Maps a function over tasks, as ``map`` does."""
 
 
 class _Race:
@@ -385,7 +385,7 @@ class _Race:
         self.total: int | None = None  # directions that will be checked, summed over the contenders; as far as known
 
     def goes_on(self) -> bool:
-        """Whether the search may."""
+        """Whether the search may go on."""
         return self._goes_on(self.done, self.total)
 
     def contender(self, site: Site, estimate: ReachEstimate) -> _Contender:
@@ -453,7 +453,7 @@ class _Race:
         )
 
     def rated(self, one: _Contender, placement: Placement | None) -> RatedPlacement:
-        """A contender with what it is worth."""
+        """A contender as a rated placement."""
         verdict = self.verdict(one)
         expected = expected_tip_error_mm(self._case, placement, one.T_base_ct, verdict.q_insertion)
         return RatedPlacement(one.site, one.mount, one.estimate, verdict, expected)
@@ -527,7 +527,7 @@ def placement_rows(search: PlaceSearch) -> list[dict[str, Any]]:
 
 
 def place_document(search: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything as plain values: mm; fractions and margins 0..1."""
+    """The document of a search as plain values: mm; fractions and margins 0..1."""
     rows = placement_rows(search)
     for row, one in zip(rows, search.every, strict=True):
         row["mount"] = {key: list(value) for key, value in one.mount.model_dump().items()}

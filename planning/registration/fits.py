@@ -338,7 +338,7 @@ class NoiseTest:
         return float(np.sqrt(chdtri(3, 1 - INTERVAL)))
 
     def text(self) -> str:
-        """What the test found, in one sentence."""
+        """Result of the test, in one sentence."""
         low, high = self.interval
         size = f"the residuals show {self.estimate:.2f} times the declared errors (95 %: {low:.2f} to {high:.2f})"
         if self.found:

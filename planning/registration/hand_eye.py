@@ -86,7 +86,7 @@ def noise_of(stated: Sequence[float | None]) -> HandEyeNoise | None:
 
 @dataclass(frozen=True, eq=False)
 class PosePairs(Shown):
-    """What arm and camera said. Checked when made; the arrays are read-only.
+    """Paired poses of arm and camera, checked when made; the arrays are read-only.
 
     Raises InputError: Other shapes, names that are used twice, or a matrix that is no rigid motion.
     """
@@ -150,18 +150,18 @@ class HandEye(Shown):
     """T_base_board, shape (4, 4), mm; None for motions."""
     names: tuple[str, ...]
     residuals: Floats
-    """Of rotation (rad) and translation (mm), shape (n, 6)."""
+    """Residuals of rotation (rad) and translation (mm), shape (n, 6)."""
     covariance: Floats
     """Shape (12, 12), or (6, 6) for motions: rotation (rad, on the right) and translation (mm) of X, of Z."""
     freedom: int
     noise: HandEyeNoise | None
-    """As stated; None where the spreads were found."""
+    """The stated noise; None where the spreads were estimated."""
     spread: tuple[float, float]
     """Of the residuals, rad and mm: their rms over what the unknowns leave free."""
     least_freedom: float
     """Of the spread that is known least; infinite where the noise was stated."""
     chi_squared: float | None
-    """Of the residuals, where the noise was stated."""
+    """Chi-squared of the residuals, where the noise was stated."""
     condition: float
     """Least over largest singular value of the Jacobian, lengths in 100 mm."""
     outliers: tuple[str, ...]

@@ -207,7 +207,7 @@ def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
 
 
 APART_MM = 20.0
-"""One more marker is no nearer than this to those that are there."""
+"""Least distance of a further marker from those that are there."""
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ class ResidualTest:
 
     @property
     def probability(self) -> float:
-        """Of residuals as large as these by the declared noise; NaN where none is declared."""
+        """Chance of residuals as large as these by the declared noise; NaN where none is declared."""
         return float(chdtrc(self.freedom, self.chi_squared))
 
     @property
@@ -175,7 +175,7 @@ class ResidualTest:
         return "estimated from FRE of the rigid fit"
 
     def text(self) -> str:
-        """What the test found, in words."""
+        """Result of the test, in words."""
         if self.declared_fle_mm is None:
             what = "exceeds" if not self.explained else "keeps"
             return f"FRE {self.fre_mm:.2f} mm {what} the {MAX_FRE_MM:g} mm allowed without a declared fle_mm"
@@ -235,7 +235,7 @@ class OutlierMarker(NamedTuple):
         )
 
     def finding(self) -> Finding:
-        """The same, as a warning."""
+        """The outlier marker as a warning."""
         numbers: dict[str, float | str] = {"miss_mm": self.miss_mm, "others_fre_mm": self.others_fre_mm}
         return Finding("outlier_marker", Severity.WARNING, self.text(), {"marker": self.name, **numbers})
 
@@ -436,7 +436,7 @@ ALLOWED_RESIDUALS = "check names and readings, declare the true errors, or set r
 
 @dataclass(frozen=True, eq=False)
 class Registration(Shown):
-    """T_base_ct from markers, and what is known of its error."""
+    """T_base_ct from markers, with its residuals and its expected error."""
 
     method: str
     T_base_ct: Floats  # shape (4, 4), rigid, mm
@@ -446,7 +446,7 @@ class Registration(Shown):
     conditioning: Conditioning
     """The three flags of a weak set, for the target given."""
     target_ct: Floats
-    """That target, shape (3,), mm."""
+    """The target of ``conditioning``, shape (3,), mm."""
     uncertainty: FitUncertainty | None = None
     """Covariance by the declared errors; None where none are declared."""
     aim: Aim | None = None
@@ -481,7 +481,7 @@ class Registration(Shown):
 
     @property
     def fle_interval_mm(self) -> Interval:
-        """The 95 % interval of that number: one value where it is declared and agrees with the residuals."""
+        """The 95 % interval of `fle_mm`: one value where it is declared and agrees with the residuals."""
         if self.uncertainty is None:
             return self.residual_test.fle_interval_mm
         test, fle = self.uncertainty.test, self.uncertainty.fle_mm

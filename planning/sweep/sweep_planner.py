@@ -54,7 +54,7 @@ class SweepPlan:
 
 
 STEP = np.radians(1.0)
-"""Between two directions that are checked, at most: half of the search's usual grid."""
+"""Greatest angle between two checked directions: half of the search's usual grid."""
 MOST_JOINT_STEP = 0.2
 """A joint that turns more from one direction to the next jumps, rad."""
 SWEEP_SPEED_MM_S = 30.0

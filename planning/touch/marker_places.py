@@ -42,13 +42,13 @@ from puncture_twin.planning.uncertainty.pose_error import touch_candidates
 DRAWN, PLACES, BETWEEN_PLACES_MM = 12_000, 300, 9.0
 """Places of the skin that are drawn and that are tried, and the least distance between two of these."""
 FAR_MM = 150.0
-"""From the target: farther away the skin moves on its own, and an arm does not reach both."""
+"""Greatest distance from the target: farther away the skin moves on its own, and an arm does not reach both."""
 APART_MM = 35.0
-"""Markers are no nearer to each other."""
+"""Least distance between two markers."""
 WINDOW_MM = 25.0
-"""From an entry of a safe direction: half a drape's hole, and a finger."""
+"""Least distance from an entry of a safe direction: half a drape's hole, and a finger."""
 END_MM = 15.0
-"""From where the image ends, and from what lies on the skin or is no trunk: arms, the table."""
+"""Least distance from where the image ends, and from what lies on the skin or is no trunk: arms, the table."""
 RELAXED = ((1.0, 1.0), (0.5, 1.0), (0.2, 1.0), (0.5, 2.0), (0.2, 5.0))
 """Times what is wanted from windows and between places, and times the farthest from the target: one pair after the
 other, until there are places."""
@@ -87,7 +87,7 @@ class MarkerPlace:
     tape: Tape | None  # round the body at that level; None where the image cuts the body's sides
 
     def words(self, space: Space) -> str:
-        """How to find it on the skin; a space of its own has no anatomy, and is told by coordinates."""
+        """Directions to find the place on the skin; a space of its own has no anatomy, and is told by coordinates."""
         if space is Space.LOCAL:
             return f"at {point_text(self.point_ct, space)}"
         end = "head" if self.head_mm >= 0 else "feet"
@@ -100,7 +100,7 @@ class MarkerPlace:
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Places for markers."""
+    """Proposed places for markers, with the expected error that they leave."""
 
     places: tuple[MarkerPlace, ...]
     expected_mm: float  # error (rms) at the target by reading and touching these markers; of the arm's own nothing
@@ -198,7 +198,7 @@ def _places(case: Case, anatomy: Anatomy, entries: cKDTree) -> _Skin:
 
 
 def _others(anatomy: Anatomy) -> list[TriangleMesh]:
-    """What the CT shows that is not the trunk: arms at its side or across it, the table."""
+    """Surfaces in the CT that are not the trunk: arms at its side or across it, the table."""
     return [one.mesh for one in anatomy.surroundings if one.name in (ATTACHED_LIMB, OUTSIDE_BODY)]
 
 

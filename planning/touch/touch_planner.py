@@ -50,7 +50,7 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_er
 PLANNED_PADDING_MM = 4.0
 """Distance of a touching needle's shaft from the patient in a plan: the markers are only believed to be there."""
 TOUCHING_PADDING_MM = 1.0
-"""The same distance while touching, when the needle's line was set onto the marker."""
+"""Distance of the needle's shaft from the patient while touching, when the needle's line was set onto the marker."""
 ALLOWED = "a case with [errors] and markers"
 
 MOST_MARKERS = 12
@@ -100,7 +100,7 @@ class _Task:
         return self.context.case.needle.length_mm
 
     def of(self, rows: Sequence[int]) -> _Task:
-        """The same task for some of its markers."""
+        """The task for some of its markers."""
         at, names = list(rows), self.markers.names
         points_ct, points_base = self.markers.points_ct[at], self.markers.points_base[at]
         return replace(self, markers=MarkerPairs(tuple(names[row] for row in at), points_ct, points_base))
@@ -223,7 +223,7 @@ def _touchable(task: _Task) -> _Touchable:
 
 
 LEAST_POSES, MOST_POSES = 4, 12
-"""The order of more takes too long to be the best one."""
+"""Poses of a pivot: for more the best order takes too long to find."""
 SPREAD = 2
 """So many free poses are wanted for each that is taken: else they lean to one side."""
 RADII = (0.6, 0.8, 0.45)
@@ -231,7 +231,7 @@ RADII = (0.6, 0.8, 0.45)
 HEIGHTS = (0.0, 0.3, -0.3, 0.6)
 """Heights above the shoulder at which the flange is tried, over the same reach."""
 SIDES = 12
-"""Directions from the base in which they lie."""
+"""Directions from the base in which the flange is tried."""
 ROLLS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3)
 """Rolls of the flange about the needle, added to each tilt: they tell how far the tip is off the flange's axis."""
 RIDGE = 1e-6

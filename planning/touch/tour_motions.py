@@ -50,7 +50,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class TouchTour:
-    """Touches one after another."""
+    """Touches in order, each with the motion to it, and the motion home."""
 
     model: UrModel
     tip_mm: float

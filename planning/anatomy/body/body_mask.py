@@ -59,7 +59,7 @@ def measured_hu(hu: NDArray[Any]) -> tuple[NDArray[Any], Bools]:
 
 
 def find_unscanned(hu: NDArray[Any]) -> Bools:
-    """What the scanner did not measure, shape of the image (nx, ny, nz), HU, axis 2 along the patient.
+    """Voxels that the scanner did not measure, shape of the image (nx, ny, nz), HU, axis 2 along the patient.
 
     It is far below air; or a slice of one value; or what holds together with a corner of the image by cubes of one
     value. In an image without noise nothing tells such a value from that of air: then it is air.
@@ -130,19 +130,19 @@ class CtImage:
 
     @cached_property
     def found(self) -> BodyMask:
-        """The body."""
+        """The body's voxels, found in the image."""
         about = self.shown.about
         at = None if about is None else np.rint(apply(np.linalg.inv(self.T_ct_index), np.array(about))).astype(int)
         return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown, unscanned=self.unscanned, at=at)
 
     @cached_property
     def unscanned(self) -> Bools:
-        """What was not measured."""
+        """Voxels that were not measured, shape of the image."""
         return find_unscanned(self.hu) if self.not_measured is None else self.not_measured
 
     @property
     def content(self) -> Content:
-        """Where what is as dense as a body ends."""
+        """The ends of all that is as dense as a body."""
         return content_of(self.hu > BODY_HU, self.T_ct_index)
 
     def within(self, box: Box, shown: Shown = PATIENT) -> CtImage:

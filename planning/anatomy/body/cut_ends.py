@@ -44,7 +44,7 @@ ENDS_FLAT = (
 
 @dataclass(frozen=True, eq=False)
 class FieldOfView:
-    """What was imaged: beyond a face that cuts the body, the body goes on (`planning.anatomy.unseen`)."""
+    """The imaged box: beyond a face that cuts the body, the body goes on (`planning.anatomy.unseen`)."""
 
     T_ct_box: NDArray[np.float64]
     """Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the patient's left, back

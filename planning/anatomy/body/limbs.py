@@ -51,7 +51,7 @@ FULL = np.ones((3, 3, 3), bool)
 
 
 class Piece(NamedTuple):
-    """What may be a limb, as blocks; it is none where the target lies in ``near``."""
+    """A piece that may be a limb, as blocks; it is none where the target lies in ``near``."""
 
     near: Bools  # alone a limb's where the target lies in ``whole``
     whole: Bools

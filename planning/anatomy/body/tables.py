@@ -275,7 +275,7 @@ class Support(NamedTuple):
 def find_support(
     outside: Bools, body: Bools, spacing_mm: Floats, touching: Sequence[TableSide] = (), shown: Shown = PATIENT
 ) -> Support:
-    """What the body lies on, and the faces of the image beyond which nothing is known.
+    """The support that the body lies on, and the faces of the image beyond which nothing is known.
 
     ``outside`` was scanned, lies outside of the body (nx, ny, nz), and is not air; tables that touch the body are not
     in it.

@@ -46,7 +46,7 @@ CAUSES = (
 )
 MARKERS_TELL = " (markers_ct and markers_base with it would check it)"
 BOX_TELLS = " (so does the patient support, as an obstacle of frame base)"
-"""What makes a warning needless."""
+"""Further evidence that would make a warning needless."""
 ALLOWED = "a transform between this CT and this robot's base, with transform_maps and base_axes as saved"
 
 
@@ -68,7 +68,7 @@ class Reading:
 
     @property
     def usual(self) -> tuple[bool, bool]:
-        """Whether it is usual: the patient lies on something, and the arm is mounted upright."""
+        """Whether the patient lies on something, and whether the arm is mounted upright, as is usual."""
         return bool(self.rests_on), self.tilt <= UPRIGHT
 
     def better_than(self, other: Reading) -> bool:
@@ -76,7 +76,7 @@ class Reading:
         return any(mine and not theirs for mine, theirs in zip(self.usual, other.usual, strict=True))
 
     def text(self) -> str:
-        """What speaks for it or not, in words."""
+        """Arguments for and against this reading, in words."""
         lies = f"on '{self.rests_on}'" if self.rests_on else "on no obstacle of frame base"
         return f"the patient lies {lies} and the robot's z axis {np.degrees(self.tilt):.0f} deg from up"
 

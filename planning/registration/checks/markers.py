@@ -42,7 +42,7 @@ from puncture_twin.planning.registration.registration import Registration
 ALLOWANCE_MM = 30.0
 """A mattress gives way and a box is measured by hand: so deep a patient may lie in one, or to its middle."""
 THIN = 0.05
-"""Of a box's half size is left of it at least, so that a patient who goes through a thin one is seen."""
+"""Least fraction of a box's half size that is left of it, so that a patient who goes through a thin one is seen."""
 REST_MM = 100.0
 """Mattress and cushions between a table and the patient on it."""
 FAR_MM = 400.0
@@ -203,7 +203,7 @@ def boxes_ct(case: Case) -> tuple[Obstacle, ...]:
 
 
 def box_keys(boxes: tuple[Obstacle, ...]) -> tuple[tuple[str, bytes, bytes], ...]:
-    """What boxes are, as part of a key."""
+    """Key of boxes in a cache: names, centres, sizes."""
     return tuple((box.name, box.center_mm.tobytes(), box.size_mm.tobytes()) for box in boxes)
 
 
@@ -284,7 +284,7 @@ MARKER_ON_SKIN_MM = 30.0
 
 @dataclass(frozen=True, eq=False)
 class SkinFit:
-    """Markers against the skin."""
+    """Distances of markers from the skin, and the skin's normals there."""
 
     gaps_mm: Floats
     """Shape (n,), distance from the skin, negative inside the body (of an open skin that is not known)."""
@@ -408,7 +408,7 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[
 
 
 def _worst(permuted: Sequence[Renaming]) -> str:
-    """The first, which puts the target farthest away, and how many more there are."""
+    """Text of the permutation that puts the target farthest away, and how many more there are."""
     more = len(permuted) - 1
     return permuted[0].text() + (f" (and {plural(more, 'more permutation')})" if more else "")
 
