@@ -34,7 +34,8 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.fast_engine import NearFaces, near_faces
+from puncture_twin.planning.base.processes import on_threads
+from puncture_twin.planning.clearance.fast_engine import MOST_THREADS, NearFaces, near_faces
 from puncture_twin.planning.clearance.kernels.blocks import Blocks
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.segment_triangle import beyond, displaced_distance
@@ -69,9 +70,11 @@ def refined(
     or that and a margin; mm. A structure of which no face is within the needle's reach keeps its first order: it is
     touched less than once in 100,000 times.
     """
-    found = first.copy()
+    chances = first.copy()
     rows = np.flatnonzero((wanted & np.isfinite(first)).any(axis=1))
-    for row in rows:
+
+    def refine(k: int) -> None:
+        row = rows[k]
         outward = needles.outward_ct[row]
         pose = needle_uncertainty(target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
         for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])).tolist():
@@ -84,8 +87,11 @@ def refined(
             faces = near_faces(blocks[column], target_ct, outward, axis, reach)
             if len(faces):
                 chance = line_chance(faces, uncertainty, axis, threshold, needles.near.gradient[row, column])
-                found[row, column] = first[row, column] if np.isnan(chance) else chance
-    return found
+                chances[row, column] = first[row, column] if np.isnan(chance) else chance
+
+    for _ in on_threads(refine, len(rows), MOST_THREADS):
+        pass
+    return chances
 
 
 def line_chance(
@@ -330,7 +336,7 @@ NUDGE_MM = 1e-6
 ROOT_HALF = math.sqrt(0.5)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def walked(problem, root, surface_mm, basis, offsets, sizes):  # type: ignore[no-untyped-def]  # numba infers
     """The chance along each line, shape (n,); its errors are so many times as large (n,)."""
     chances, hint = np.empty(len(offsets)), np.int64(0)
@@ -420,7 +426,7 @@ RAYS_TO, RAY_STEP = 4.0, 0.1
 """Standard deviations that a ray is followed, and its smallest step: it only tells what is touched about as soon."""
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-def]
     """Fill, for rays along ``directions`` (n, 5) from the nominal needle, how far out each touches; or infinity."""
     triangles, faces, blocks, origin, outward, length, threshold = problem
