@@ -25,8 +25,8 @@ from puncture_twin.planning.case.settings import Motion, Stereo, Ultrasound
 from puncture_twin.planning.case.tables import ControlScanSection
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.chances import chance_model
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.uncertainty.chance_model import chance_model
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import pose_error

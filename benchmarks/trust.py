@@ -35,10 +35,10 @@ from puncture_twin.planning.registration.fits import FitUncertainty, Method, Noi
 from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import aim_at, aimed, load_placement
-from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.registration import aim_at, register
+from puncture_twin.planning.search.chances import ChanceModel, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import organ_candidates
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding, refined_chances
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.trials import Puncture, Trials, draw_trials

@@ -32,7 +32,7 @@ FUNCTIONS = {
     "planning.search.search": {"organ_distances": "search", "organ_candidates": "search"},
     "planning.search.constraints": {"with_reach": "reach"},
     "planning.search.phases": {"with_breathing_reach": "reach"},
-    "planning.search.candidate_chances": {"with_chances": "chances", "with_best_chances": "chances"},
+    "planning.search.chances": {"with_chances": "chances", "with_best_chances": "chances"},
     "planning.search.ranking": {"ranked": "ranking"},
     "planning.search.uncertainty_breakdown": {"uncertainty_breakdown": "chances"},
 }

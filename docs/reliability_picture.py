@@ -42,7 +42,7 @@ def rehearsed(path, factor, directions, rooms):
 def scaled(context, factor):
     """The context of a case whose errors are declared larger."""
     from puncture_twin.planning.registration import placement
-    from puncture_twin.planning.uncertainty.chance_model import chance_model
+    from puncture_twin.planning.search.chances import chance_model
     from puncture_twin.planning.uncertainty.pose_error import pose_error
 
     case = replace(load_case(context.case.path), errors=context.case.errors.scaled(factor))

@@ -40,11 +40,11 @@ from puncture_twin.planning.registration.marker_noise import reading_noise, touc
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.bending import path_layers
+from puncture_twin.planning.search.chances import ChanceModel
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import moving_weights
 from puncture_twin.planning.uncertainty import guided
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.visibility.cameras import CameraView, Watched, camera_view
 from puncture_twin.planning.visibility.probe import ProbeView, probe_view

@@ -15,10 +15,9 @@ from puncture_twin.planning.collision_cases import checks_file, session as runs
 from puncture_twin.planning.collision_cases.session import Difference, Finding, NewNumber, Session, session_of, updating
 from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.plan.plan_document import read_plan
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import Candidates, nearest_row
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text
-from puncture_twin.planning.search.windows import nearest_row
 
 DIGIT, LEAST_DIGIT_MM, CHANCE_DIGIT, DIGIT_SQUARE_DEG = 0.1, 0.01, 0.01, 1.0
 """Steps of rewritten numbers: a fraction of a tolerance, which keeps the rest; of a least clearance, mm; of a chance

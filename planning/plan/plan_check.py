@@ -21,9 +21,9 @@ from puncture_twin.planning.motion.trajectory import Peaks
 from puncture_twin.planning.plan.plan import Plan, motion_contact, phase_clearances
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.chances import satisfies_limits
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 POSE_TOLERANCE_MM = 0.01

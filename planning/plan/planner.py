@@ -19,12 +19,12 @@ from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.plan.plan import Plan, motion_contact, phase_clearances
 from puncture_twin.planning.reach.reach import ReachAnswer, approach_goals
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.chances import satisfies_limits
 from puncture_twin.planning.search.choice import BEST, Choice, choose
 from puncture_twin.planning.search.constraints import reach_request
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.planning.search.ranking import ranked
-from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20

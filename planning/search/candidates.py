@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -21,8 +21,6 @@ from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
 from puncture_twin.planning.base.text import Facts, Shown, brief, plural
 from puncture_twin.planning.case.entry import AngleGrid
-from puncture_twin.planning.search.windows import Windows, find_windows
-from puncture_twin.planning.uncertainty.chance_model import Chances
 
 ARM_CHECKED = "checked"
 """``Candidates.arm_note`` where "safe" includes that the arm can reach and insert along the candidate."""
@@ -30,6 +28,10 @@ CONE_OF_GRID, CONE_CERTIFIED = "grid", "certificate"
 """Where a safe cone comes from: the directions of the search, or the proof of all between them."""
 NOT_SEEN = "not seen: image or mesh ends"
 """Named in place of the skin for a path that leaves the scanned region."""
+SQUARE_DEGREES = float(np.degrees(1.0) ** 2)
+"""Square degrees in a steradian."""
+MOST_WINDOWS = 10
+"""Windows that are listed to people."""
 ANGLE_DIGITS = 9
 """Decimals of an angle in degrees: 59.99999999999999 is 60; 1e-9 degrees move no needle by a nanometre."""
 
@@ -152,6 +154,102 @@ class BreathingColumns(Columns):
     """Shape (n,), the least to any structure with a margin, in the window, mm; NaN for what was rejected before."""
     safe_when: str
     """At each phase, or in the gate's window, if inserted then; never that a needle may stay."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chances(Columns):
+    """Chances of n candidates and k structures that demand a margin; NaN where nothing was computed."""
+
+    structures: tuple[str, ...]
+    hit: Floats  # shape (n,), that the tip is in the target's mesh, or within its radius
+    touch: Floats  # shape (n, k), that the needle touches each structure
+    margin: Floats  # shape (n, k), that it breaks each structure's margin
+    touch_any: Floats  # shape (n,), min(1, sum of touch): never below the truth of what `touch` says
+    touch_joint: Floats
+    """Shape (n,), that it touches any, all linearised together; of the best candidates alone."""
+    lateral_mm: Floats
+    """Shape (n,), expected (rms) error of the tip across the needle, target reading included."""
+    depth_mm: Floats  # shape (n,), along it
+    refined: Bools  # shape (n,), whether touch and margin are line-sampled; else they are of first order
+
+    @classmethod
+    def unknown(cls, structures: tuple[str, ...], count: int) -> Chances:
+        """The chances of candidates for which nothing was computed."""
+        shapes = {"touch": (count, len(structures)), "margin": (count, len(structures))}
+        names = {field.name for field in fields(cls)} - {"structures", "refined"}
+        blank = {name: np.full(shapes.get(name, (count,)), np.nan) for name in names}
+        return cls(structures, refined=np.zeros(count, bool), **blank)
+
+    def put(self, rows: Ints, known: Chances) -> Chances:
+        """These chances with those of some candidates replaced."""
+        values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}
+        for name, value in values.items():
+            value[rows] = getattr(known, name)
+        return Chances(self.structures, **values)
+
+
+@dataclass(frozen=True, repr=False)
+class Window(Shown):
+    """One connected set of safe directions."""
+
+    number: int
+    """1 for the window that holds the best candidate, then by the rank of each one's best."""
+    best: int  # row of its best candidate
+    directions: int
+    square_deg: float
+    entry_cm2: float
+    """Area of skin through which its paths enter, cm2."""
+    widest_cone: float
+    """Largest safe cone of its candidates, rad; NaN where none is known."""
+
+    @property
+    def wide_deg(self) -> float:
+        """Width of a cone of the same solid angle, degrees."""
+        return 2.0 * float(np.degrees(np.arccos(1.0 - self.square_deg / SQUARE_DEGREES / (2.0 * np.pi))))
+
+    @property
+    def text(self) -> str:
+        """The window's size for a person."""
+        return f"{self.entry_cm2:.1f} cm2 on the skin, {self.wide_deg:.0f} deg wide"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Windows(Shown):
+    """All windows of a search."""
+
+    of_row: Ints
+    """Shape (n,), the number of each candidate's window; 0 for a rejected candidate."""
+    windows: tuple[Window, ...]
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __iter__(self) -> Iterator[Window]:
+        return iter(self.windows)
+
+    def __getitem__(self, at: int) -> Window:
+        return self.windows[at]
+
+    @property
+    def largest(self) -> Window | None:
+        """The window with the most skin; None where nothing is safe."""
+        return max(self.windows, key=lambda one: one.entry_cm2, default=None)
+
+    @property
+    def headline(self) -> str:
+        """One sentence on how much is safe."""
+        one = self.largest
+        if one is None:
+            return "no window: nothing is safe"
+        return f"the largest window: {one.text}, {one.number} of {len(self.windows)}"
+
+    def _facts(self) -> Facts:
+        yield "count", str(len(self.windows))
+        yield "largest", "–" if self.largest is None else self.largest.text
+
+    def rows(self, number: int) -> Ints:
+        """The candidates of one window."""
+        return np.flatnonzero(self.of_row == number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,3 +450,49 @@ def _step(values: Floats) -> float:
     gaps = np.diff(np.unique(values))
     gaps = gaps[gaps > SAME_ANGLE]
     return float(gaps.min()) if len(gaps) else ALONE
+
+
+def find_windows(candidates: Candidates) -> Windows:
+    """The windows of ranked `Candidates`; without a grid every candidate is one of its own, without area."""
+    label = connected(candidates.grid, candidates.safe)
+    ranked = candidates.ranked
+    firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]  # best of each set, by rank
+    number = np.zeros(len(candidates), np.int64)
+    for one, row in enumerate(firsts, start=1):
+        number[(label == label[row]) & candidates.safe] = one
+    cell = np.zeros(len(candidates)) if candidates.grid is None else candidates.grid.solid_angle()
+    # each cell's skin, mm2: the sphere's patch over the cosine of the skin angle
+    skin, windows = cell * candidates.path.length**2 / np.cos(candidates.path.skin_angle), []
+    for one, best in enumerate(firsts.tolist(), start=1):
+        rows = number == one
+        square_deg, entry_cm2 = float(cell[rows].sum()) * SQUARE_DEGREES, float(skin[rows].sum()) / 100.0
+        widest = float(np.fmax.reduce(candidates.safe_cone[rows]))
+        windows.append(Window(one, best, int(rows.sum()), square_deg, entry_cm2, widest))
+    return Windows(number, tuple(windows))
+
+
+def nearest_row(candidates: Candidates, outward_ct: Floats) -> int | None:
+    """Row of the grid nearest to a direction, shape (3,); None where it is beyond the grid by a step."""
+    row = int(np.argmax(candidates.outward_ct @ outward_ct))  # largest cosine
+    near = candidates.outward_ct[row]
+    apart = float(np.arctan2(np.linalg.norm(np.cross(near, outward_ct)), near @ outward_ct))
+    return None if candidates.grid is None or apart > candidates.grid.step else row
+
+
+def connected(grid: AngleGrid | None, safe: Bools) -> Ints:
+    """Label of each row's connected set, shape (n,): the least row among neighbouring safe ones.
+
+    A label is a row of the same set. Where neighbours differ, the row that one names takes the other's label if that is
+    less, and all rows take the label of the row that they name (Shiloach and Vishkin, J. Algorithms 3, 1982).
+    """
+    if grid is None:
+        return np.arange(len(safe))
+    pairs = grid.neighbours()
+    one, other = pairs[safe[pairs].all(axis=1)].T
+    label: Ints = np.arange(len(safe))
+    while not np.array_equal(label[one], label[other]):
+        least, ends = np.minimum(label[one], label[other]), (label[one], label[other])
+        for end in ends:
+            np.minimum.at(label, end, least)
+        label = label[label]  # pointer jumping
+    return label

@@ -38,13 +38,13 @@ from puncture_twin.planning.registration.placement import Placement, load_placem
 from puncture_twin.planning.search.bedside import EntryFacts, Landmark, entry_facts
 from puncture_twin.planning.search.bending import check_tissues
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
+from puncture_twin.planning.search.chances import ChanceModel, chance_model
 from puncture_twin.planning.search.constraints import ArmReach
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import breath_warnings
 from puncture_twin.planning.search.search import organ_safe, search
 from puncture_twin.planning.search.sides import Side, sides_of, sides_text
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, uncertainty_breakdown
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})

@@ -10,11 +10,9 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.entry import AngleGrid, outward
 from puncture_twin.planning.case.tables import RankingSection
-from puncture_twin.planning.search.candidates import CONE_OF_GRID, Candidates, Ranking
+from puncture_twin.planning.search.candidates import Candidates, Ranking
 
 COMFORT_MM = 20.0
 """Clearance from which on more is no better: several times any registration error that a case should have."""
@@ -132,62 +130,3 @@ def pareto_front(terms: Floats) -> Bools:
         stays = (left[1:] < left[0]).any(axis=1) | (left[1:] == left[0]).all(axis=1)
         left, order = left[1:][stays], order[1:][stays]
     return front
-
-
-DIAGONAL = np.sqrt(2.0)
-"""Diagonal of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
-
-
-def with_grid_cone(candidates: Candidates, grid: AngleGrid) -> Candidates:
-    """The candidates of a grid with the safe cone of each safe one."""
-    cone = np.full(len(candidates), np.nan)
-    cone[candidates.safe] = grid_cone(grid, candidates.safe)
-    return replace(candidates, safe_cone=cone, cone_source=CONE_OF_GRID)
-
-
-def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
-    """Safe cone of each safe direction: how far it may be off in any direction, shape (safe ones,), rad.
-
-    The angle to the nearest direction of the grid that is not safe, or to the nearest beyond the grid, less a cell's
-    diagonal. A disc as wide as that diagonal holds a direction of the grid; so where such a disc fits into what is not
-    safe, at its border, the cone ends before it. What is thinner may pass between the directions: only a
-    certificate excludes that.
-
-    Args:
-        safe: Shape (n,), row by row.
-    """
-    theta, beta = np.repeat(grid.theta, len(grid.beta)), np.tile(grid.beta, len(grid.theta))
-    border = _border(grid, safe)
-    barred = np.concatenate([outward(theta[border], beta[border]), outward(*grid.beyond())])
-    if not len(barred):
-        return np.full(int(safe.sum()), np.pi)
-    chord = np.empty(int(safe.sum()))
-    _least_chords(outward(theta[safe], beta[safe]), barred, chord)
-    return np.maximum(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)) - DIAGONAL * grid.step, 0.0)
-
-
-def _border(grid: AngleGrid, safe: Bools) -> Bools:
-    """Unsafe directions next to a safe one, or at the grid's end: among them is one nearest to any safe direction.
-
-    They are not safe themselves, and lie next to a safe one or at an end of the azimuths. From any other, the step
-    towards the safe one, first in azimuth the shorter way and then in θ, stays in the grid and ends nearer (at a pole
-    in the same direction) in one that is not safe either.
-    """
-    pairs = grid.neighbours()
-    ends = pairs[safe[pairs[:, 0]] != safe[pairs[:, 1]]].ravel()
-    border = np.zeros((len(grid.theta), len(grid.beta)), bool)
-    border.ravel()[ends] = True
-    if not grid.full_circle:
-        border[:, [0, -1]] = True
-    return np.asarray(border.ravel() & ~safe)
-
-
-@allocation_free()
-def _least_chords(points, others, chords):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``chords`` (n,) with the distance of each point (n, 3) from the nearest of the others (m, 3)."""
-    for i in range(len(points)):
-        least = np.inf
-        for k in range(len(others)):
-            x, y, z = points[i, 0] - others[k, 0], points[i, 1] - others[k, 1], points[i, 2] - others[k, 2]
-            least = min(least, x * x + y * y + z * z)
-        chords[i] = np.sqrt(least)

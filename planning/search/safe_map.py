@@ -21,9 +21,9 @@ from puncture_twin.planning.formats.guard import guard_points, points_array
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.search.candidates import SQUARE_DEGREES, connected
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.search import first_blocking
-from puncture_twin.planning.search.windows import SQUARE_DEGREES, connected
 
 NOT_TESTED_OF_WINDOWS = "bending, breathing, arm, chances"
 NOT_TESTED = f"skin entry and angle, {NOT_TESTED_OF_WINDOWS}"

@@ -20,12 +20,11 @@ from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths, case_paths
 from puncture_twin.planning.search.bending import with_bending
-from puncture_twin.planning.search.candidate_chances import with_best_chances, with_chances
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, ClearanceColumns, Path, Ranking
-from puncture_twin.planning.search.constraints import ArmReach, first_broken, skin_allows, with_reach
+from puncture_twin.planning.search.chances import ChanceModel, with_best_chances, with_chances
+from puncture_twin.planning.search.constraints import ArmReach, first_broken, skin_allows, with_grid_cone, with_reach
 from puncture_twin.planning.search.phases import with_breathing, with_breathing_reach
-from puncture_twin.planning.search.ranking import ranked, with_grid_cone
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel
+from puncture_twin.planning.search.ranking import ranked
 
 
 def search(

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.uncertainty.chance_model import Chances
 
 TABLE = "candidates.parquet"
 """Its name in a folder."""
@@ -71,7 +70,7 @@ def _choice_columns(candidates: Any) -> dict[str, Any]:
     }
 
 
-def chance_columns(chances: Chances) -> dict[str, NDArray[Any]]:
+def chance_columns(chances: Any) -> dict[str, NDArray[Any]]:
     """The columns of a case that declares errors, after all others."""
     wide = {
         f"p_{kind}_{name}": getattr(chances, kind)[:, at]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances, touch_limit
+from puncture_twin.planning.search.chances import ChanceModel, refined_chances, touch_limit
 from puncture_twin.planning.uncertainty.guided import WayChance
 from puncture_twin.planning.uncertainty.hit import Proximity, hit_in_ball, hit_in_mesh, touch_chance
 from puncture_twin.planning.uncertainty.lines import Needles

@@ -9,9 +9,9 @@ from uncertainty_world import ball
 
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.plan.planner import make_plan
+from puncture_twin.planning.search.candidates import find_windows
 from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.choosing.compare_job import BEST_OF_ALL, compare_choices, parse_two, two_plans
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK

@@ -18,8 +18,8 @@ from puncture_twin.planning.collision_cases.collector import (
 from puncture_twin.planning.collision_cases.session import MOST_LINES
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.plan.planner import make_plan
+from puncture_twin.planning.search.candidates import find_windows
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.windows import find_windows
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.candidates import find_windows
 from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.patient.export_jobs import export_path
 

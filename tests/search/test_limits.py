@@ -10,11 +10,10 @@ from refusals import refused
 from scipy.special import ndtr
 from uncertainty_world import MOUNT, ball
 
-from puncture_twin.planning.search import candidate_chances
-from puncture_twin.planning.search.candidate_chances import limited
+from puncture_twin.planning.search import chances as of_candidates
+from puncture_twin.planning.search.candidates import Chances, find_windows
+from puncture_twin.planning.search.chances import limited, refined_chances, satisfies_limits
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.windows import find_windows
-from puncture_twin.planning.uncertainty.chance_model import Chances, refined_chances, satisfies_limits
 from puncture_twin.planning.uncertainty.hit import proximity, touch_bound, touch_chance
 
 LIMITS = "min_hit = 0.999\nmax_touch = 0.0001"
@@ -134,7 +133,7 @@ def test_a_needle_that_leans_is_refined_where_it_is_most_doubtful(tmp_path, monk
     trimesh.util.concatenate([slat, ring]).export(tmp_path / "rib.ply")
     path.write_text(path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [0, 0]"))
     context = prepare(path)
-    monkeypatch.setattr(candidate_chances, "BEST", 0)  # as of the many candidates that are not among the best
+    monkeypatch.setattr(of_candidates, "BEST", 0)  # as of the many candidates that are not among the best
     found = context.search()
     assert (found.verdict.reason == "touch_likely").any() and not found.safe.any()
 
@@ -146,7 +145,7 @@ def test_what_is_shown_or_may_decide_is_line_sampled_and_the_rest_is_marked(tmp_
     path.write_text(
         path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [10, 50]").replace("[0, 80]", "[0, 40]")
     )
-    monkeypatch.setattr(candidate_chances, "BEST", 2)
+    monkeypatch.setattr(of_candidates, "BEST", 2)
     context = prepare(path)
     found = context.search()
     rows = np.flatnonzero(np.isfinite(found.chances.hit))

@@ -9,6 +9,7 @@ from places import ROOT
 from uncertainty_world import declared, world
 
 from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.search.chances import ChanceModel
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.uncertainty_breakdown import (
     WISHED_HIT,
@@ -17,7 +18,6 @@ from puncture_twin.planning.search.uncertainty_breakdown import (
     error_parts,
     goals_of,
 )
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, proximity
 from puncture_twin.planning.uncertainty.lines import Needles
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, reading_parts

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.entry import AngleGrid, outward
+from puncture_twin.planning.search.candidates import SQUARE_DEGREES, connected, find_windows
 from puncture_twin.planning.search.choice import (
     BEST,
     Choice,
@@ -23,9 +24,8 @@ from puncture_twin.planning.search.choice import (
     parse_choice,
     with_file_read,
 )
+from puncture_twin.planning.search.constraints import grid_cone, with_grid_cone
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.ranking import grid_cone, with_grid_cone
-from puncture_twin.planning.search.windows import SQUARE_DEGREES, connected, find_windows
 from tests import report_world as world
 from tests.case_world import write_case
 

@@ -10,7 +10,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.planning.search.candidate_chances import joint_touch_chance
+from puncture_twin.planning.search.chances import joint_touch_chance
 from puncture_twin.planning.uncertainty.hit import (
     chance_within,
     hit_in_ball,

@@ -36,9 +36,9 @@ from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.registration.fits import INTERVAL
 from puncture_twin.planning.registration.marker_noise import touches
+from puncture_twin.planning.search.chances import ChanceModel, chance_model, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled

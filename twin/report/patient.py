@@ -10,7 +10,7 @@ from markupsafe import Markup
 from puncture_twin.planning.base.reasons import UNSEEN_AIR, Reason, css
 from puncture_twin.planning.base.text import Facts, plural
 from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import MOST_WINDOWS, Candidates, Window
 from puncture_twin.planning.search.explain import deep_text
 from puncture_twin.planning.search.uncertainty_breakdown import (
     LEAST_FRACTION,
@@ -19,7 +19,6 @@ from puncture_twin.planning.search.uncertainty_breakdown import (
     chance_text,
     way_cells,
 )
-from puncture_twin.planning.search.windows import MOST_WINDOWS, Window
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report import numbers
 from puncture_twin.twin.report.present import Block, Field, Table, Warn, bold, facts, grid, number, percent, vector

@@ -7,8 +7,8 @@ import pytest
 import report_world as world
 from PIL import Image
 
+from puncture_twin.planning.search.candidates import Chances
 from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, UncertaintyBreakdown
-from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
 from puncture_twin.twin.report.map.map_raster import chance_raster, map_raster, touch_nothing
 from puncture_twin.twin.report.map_view import map_view

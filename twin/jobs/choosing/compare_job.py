@@ -16,11 +16,10 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import Shown, first_few, plural
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_plan
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import Candidates, nearest_row
 from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
-from puncture_twin.planning.search.windows import nearest_row
 from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
 from puncture_twin.twin.jobs.patient.run import plan_summary
 from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text

@@ -23,13 +23,12 @@ from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.bedside import EntryFacts
-from puncture_twin.planning.search.candidates import Candidates, Pick
+from puncture_twin.planning.search.candidates import MOST_WINDOWS, Candidates, Pick, Window
+from puncture_twin.planning.search.chances import touch_limit
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite, needle_warnings, reason_text
 from puncture_twin.planning.search.sides import sides_text
-from puncture_twin.planning.search.windows import MOST_WINDOWS, Window
-from puncture_twin.planning.uncertainty.chance_model import touch_limit
 from puncture_twin.twin.report import patient
 from puncture_twin.twin.report.numbers import TRUTH_IS_BELIEF
 from puncture_twin.twin.report.present import Section, footer, text

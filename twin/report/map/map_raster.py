@@ -20,8 +20,7 @@ from scipy import ndimage
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.reasons import REASON_COLOURS, UNSEEN_AIR, Reason, Rgb
-from puncture_twin.planning.search.candidates import Candidates, Pick, Verdict
-from puncture_twin.planning.search.windows import MOST_WINDOWS
+from puncture_twin.planning.search.candidates import MOST_WINDOWS, Candidates, Pick, Verdict
 from puncture_twin.twin.report.figures import halo
 from puncture_twin.twin.report.map_view import BEYOND, MapCells, MapView
 from puncture_twin.twin.report.palette import safe_shades

@@ -19,9 +19,8 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason, css
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates, Pick
+from puncture_twin.planning.search.candidates import MOST_WINDOWS, NOT_SEEN, Candidates, Pick
 from puncture_twin.planning.search.constraints import closest_miss
-from puncture_twin.planning.search.windows import MOST_WINDOWS
 from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster, shown_front
 from puncture_twin.twin.report.map_view import body_directions, map_view
 from puncture_twin.twin.report.page.template import image_address
