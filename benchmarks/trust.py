@@ -35,7 +35,7 @@ from puncture_twin.planning.registration.fits import FitUncertainty, Method, Noi
 from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import aim_at, aimed, load_placement
-from puncture_twin.planning.registration.registration import aim_at, register
+from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.search.chances import ChanceModel, demanding, refined_chances
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import organ_candidates

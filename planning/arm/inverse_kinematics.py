@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, flange_pose, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
@@ -179,3 +179,44 @@ def wrapped_solutions(model: UrModel, q: Floats) -> Floats:
         turns = np.arange(math.ceil((low - angle) / TURN), math.floor((high - angle) / TURN) + 1)
         choices.append(np.clip(angle + TURN * turns, low, high))  # the sum may round beyond
     return np.stack(np.meshgrid(*choices, indexing="ij"), axis=-1).reshape(-1, 6)
+
+
+def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
+    """Why no branch of the arm reaches one flange pose (4, 4), mm: one sentence for people."""
+    place = f"the flange would be {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
+    missing = float(missing_reach_mm(model, T_base_flange)[0])
+    if math.isinf(missing):
+        return f"{place}, its wrist too close to the base axis for any shoulder angle"
+    if missing > 0.0:
+        return f"{place}, {missing:.1f} mm out of the arm's reach in this direction"
+    solutions = inverse(model, T_base_flange)[0]
+    best = singularity(model, solutions[np.nanargmax(singularity(model, solutions).least())])
+    return f"{place}, too near the {best.nearest} singularity ({best.least():.3f}, at least {MIN_SINGULARITY})"
+
+
+def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
+    """Length by which upper arm and forearm are too short (or too long, folded) for flange poses (n, 4, 4): (n,), mm.
+
+    The least over all branches; 0 where a solution exists; infinite where no branch can turn its wrist so, because the
+    wrist centre stands inside the cylinder of radius d4 about axis 1.
+    """
+    poses = np.array(T_base_flange, dtype=np.float64, order="C").reshape(-1, 4, 4)
+    missing = np.empty(len(poses))
+    _missing_reach(model.lengths, poses, missing)
+    return missing
+
+
+@allocation_free()
+def _missing_reach(lengths, T, missing):  # type: ignore[no-untyped-def]  # numba infers
+    upper, fore, d6 = abs(lengths[1]), abs(lengths[2]), lengths[5]
+    for row in range(len(T)):
+        R, p = T[row, :3, :3], T[row, :3, 3]
+        missing[row] = math.inf
+        for side in (1.0, -1.0):
+            q1 = pan_angle(lengths, p[0] - d6 * R[0, 2], p[1] - d6 * R[1, 2], side)
+            if math.isnan(q1):
+                continue
+            for flip in (1.0, -1.0):
+                _, _, _, x, y = wrist_angles(lengths, R, p, math.cos(q1), math.sin(q1), flip)
+                far = math.sqrt(x * x + y * y)
+                missing[row] = min(missing[row], max(far - (upper + fore), abs(upper - fore) - far, 0.0))

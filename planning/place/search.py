@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
-from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.insertion import ReachRequest, flange_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
@@ -53,7 +53,6 @@ from puncture_twin.planning.place.mounts import (
     wanted_directions,
 )
 from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
-from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import Placement, default_method

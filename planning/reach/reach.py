@@ -1,6 +1,6 @@
 """Reach: which directions the arm can insert along, from a standoff pose straight to the target, without contact.
 
-`assess_reach_all` checks many directions: kinematics of all first (`survey`), then for each the motions that it
+`assess_reach_all` checks many directions: kinematics of all first (`surveyed`), then for each the motions that it
 allows, the best margin first, until one is clear. `approach_goals` lists where an approach to one direction may end.
 Retraction is the insertion backwards, so what may be inserted may be withdrawn.
 """
@@ -14,27 +14,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import first_stop, needle_lines, reach_margin
-from puncture_twin.planning.arm.inverse_kinematics import inverse, pan_angle, wrapped_solutions, wrist_angles
-from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, away_from_singularities, singularity
-from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import allocation_free
-from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.bodies import BODY_NAMES, Contact
-from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.reach.survey import (
+from puncture_twin.planning.arm.insertion import (
     MARGIN_DIGITS,
     MAX_SWEEP_MM,
     Insertion,
+    NeedleLine,
     ReachRequest,
     Surveyed,
     every_branch,
-    sampled,
+    fill_branch_path,
+    first_stop,
+    flange_poses,
+    needle_lines,
+    reach_margin,
     surveyed,
 )
+from puncture_twin.planning.arm.inverse_kinematics import why_unreachable, wrapped_solutions
+from puncture_twin.planning.arm.kinematics import away_from_singularities, link_frames
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.collision.bodies import BODY_NAMES, Contact
+from puncture_twin.planning.collision.checker import CellChecker, SweptBodies, motion_bounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +82,8 @@ def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAn
         return ReachAnswer.refused(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
     reached = away_from_singularities(model, found.starts)
     if not reached.any():
-        R, target, outward = found.line
-        T_base_flange = pose(R, target + found.distances[0] * outward)
-        return ReachAnswer.refused(Reason.UNREACHABLE, None, why_unreachable(model, T_base_flange))
+        T_base_flange = flange_poses(found.line.target, found.line.outward, found.distances[0])
+        return ReachAnswer.refused(Reason.UNREACHABLE, None, why_unreachable(model, T_base_flange[0]))
     paths = every_branch(model, found.line, found.distances)
     stops = [first_stop(model, path, found.depths) for path in paths[reached]]
     farthest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
@@ -120,8 +122,7 @@ def every_reach(checker: CellChecker, request: ReachRequest) -> list[ReachAnswer
     motions = [*found.insertions()]
     standoffs = np.array([insertion.standoff for insertion in motions]).reshape(-1, 6)
     contacts = checker.contacts(standoffs, needle_may_touch_patient=False)
-    clear = [motion for motion, contact in zip(motions, contacts, strict=True) if contact is None]
-    answers = (tried(checker, found, motion) for motion in clear)
+    answers = (tried(checker, found, *pair) for pair in zip(motions, contacts, strict=True))
     return [answer for answer in answers if isinstance(answer, ReachAnswer)]
 
 
@@ -187,7 +188,9 @@ class FirstClear:
         for row, branch, roll, standoff, contact in zip(
             rows.tolist(), branches.tolist(), rolls.tolist(), standoffs, contacts, strict=True
         ):
-            result = self._tried(row, branch, roll, standoff, contact)
+            found = self._surveyed[row]
+            motion = Insertion(found.line, branch, float(found.rolls[roll]), found.turns[branch, roll], standoff)
+            result = tried(self._checker, found, motion, contact)
             if isinstance(result, ReachAnswer):
                 self.answers[row] = result
                 self._left[row] = False
@@ -198,16 +201,6 @@ class FirstClear:
                 self._left[row] &= self._branches[row] != branch
         past = [contact is None or contact.other in BODY_NAMES for contact in contacts]  # the workcell is checked first
         self._round_clear[rows] |= np.array(past, np.bool_)
-
-    def _tried(
-        self, row: int, branch: int, roll: int, standoff: Floats, contact: Contact | None
-    ) -> ReachAnswer | Blocked:
-        if contact is not None:
-            detail = f"{contact.body} touches {contact.other} at standoff"
-            return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
-        found = self._surveyed[row]
-        insertion = Insertion(found.line, branch, float(found.rolls[roll]), found.turns[branch, roll], standoff)
-        return tried(self._checker, found, insertion)
 
     def drop_folded(self) -> None:
         """Drop the branches on which the arm touches itself at the standoff whatever the roll.
@@ -237,8 +230,13 @@ class Blocked(NamedTuple):
     contact: Contact | None = None
 
 
-def tried(checker: CellChecker, found: Surveyed, insertion: Insertion) -> ReachAnswer | Blocked:
-    """Check one motion for contacts, whose standoff is clear."""
+def tried(
+    checker: CellChecker, found: Surveyed, insertion: Insertion, contact: Contact | None
+) -> ReachAnswer | Blocked:
+    """The answer that one motion gives, by its contact at the standoff and the contacts on its way to the target."""
+    if contact is not None:
+        detail = f"{contact.body} touches {contact.other} at standoff"
+        return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
     model = checker.model
     lengths = found.request.needle_length_mm, found.request.standoff_mm
     line, branch, roll, turn, _ = insertion
@@ -257,45 +255,51 @@ def tried(checker: CellChecker, found: Surveyed, insertion: Insertion) -> ReachA
     return Blocked(depth, detail, ROLL_BODIES.isdisjoint(contact), contact=contact)
 
 
-def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
-    """Why no branch of the arm reaches one flange pose (4, 4), mm: one sentence for people."""
-    place = f"the flange would be {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
-    missing = float(missing_reach_mm(model, T_base_flange)[0])
-    if math.isinf(missing):
-        return f"{place}, its wrist too close to the base axis for any shoulder angle"
-    if missing > 0.0:
-        return f"{place}, {missing:.1f} mm out of the arm's reach in this direction"
-    solutions = inverse(model, T_base_flange)[0]
-    best = singularity(model, solutions[np.nanargmax(singularity(model, solutions).least())])
-    return f"{place}, too near the {best.nearest} singularity ({best.least():.3f}, at least {MIN_SINGULARITY})"
+def sampled(
+    swept: SweptBodies,
+    line: NeedleLine,
+    branch: int,
+    turn: Floats,
+    lengths_mm: tuple[float, float],
+    samples: int,
+    most_mm: float,
+) -> tuple[Floats, Floats]:
+    """The motion of one branch along a needle, sampled so that no body moves more than so far from state to state.
 
+    States (m, 6), rad, NaN from where the branch first does not exist; and depths (m,), mm from the standoff, even.
 
-def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
-    """Length by which upper arm and forearm are too short (or too long, folded) for flange poses (n, 4, 4): (n,), mm.
-
-    The least over all branches; 0 where a solution exists; infinite where no branch can turn its wrist so, because the
-    wrist centre stands inside the cylinder of radius d4 about axis 1.
+    Args:
+        branch: Index among the eight of ``inverse``.
+        turn: Shape (6,), rad: added to every state.
+        lengths_mm: Flange to tip, and tip to target at the standoff.
+        samples: To begin with, 2 or more.
+        most_mm: What no body's motion exceeds; see :meth:`SweptBodies.bounds_mm`.
     """
-    poses = np.array(T_base_flange, dtype=np.float64, order="C").reshape(-1, 4, 4)
-    missing = np.empty(len(poses))
-    _missing_reach(model.lengths, poses, missing)
-    return missing
+    bodies = swept.corners, swept.longest_lever_mm
+    q, depths = _sampled(swept.model.lengths, *line, branch, turn, lengths_mm, samples, bodies, most_mm)
+    return q, depths
 
 
-@allocation_free()
-def _missing_reach(lengths, T, missing):  # type: ignore[no-untyped-def]  # numba infers
-    upper, fore, d6 = abs(lengths[1]), abs(lengths[2]), lengths[5]
-    for row in range(len(T)):
-        R, p = T[row, :3, :3], T[row, :3, 3]
-        missing[row] = math.inf
-        for side in (1.0, -1.0):
-            q1 = pan_angle(lengths, p[0] - d6 * R[0, 2], p[1] - d6 * R[1, 2], side)
-            if math.isnan(q1):
-                continue
-            for flip in (1.0, -1.0):
-                _, _, _, x, y = wrist_angles(lengths, R, p, math.cos(q1), math.sin(q1), flip)
-                far = math.sqrt(x * x + y * y)
-                missing[row] = min(missing[row], max(far - (upper + fore), abs(upper - fore) - far, 0.0))
+@nb.njit(cache=True)
+def _sampled(  # type: ignore[no-untyped-def]  # numba infers
+    lengths, R, target, outward, branch, turn, lengths_mm, samples, bodies, most_mm
+):
+    """Fill the states of `sampled`: with as many more samples as the largest motion demands, until none are."""
+    needle, standoff = lengths_mm
+    while True:
+        step = standoff / (samples - 1)
+        depths, distances = np.empty(samples), np.empty(samples)
+        for k in range(samples):
+            depths[k] = k * step if k < samples - 1 else standoff
+            distances[k] = needle + standoff - depths[k]
+        q, frames, bounds = np.empty((samples, 6)), np.empty((samples, 7, 4, 4)), np.empty((samples - 1, 6))
+        fill_branch_path(lengths, R, target, outward, distances, branch, turn, q)
+        link_frames(lengths, q, frames)
+        motion_bounds(frames, q, bodies[0], bodies[1], bounds)
+        worst = bounds.max()
+        if not worst > most_mm:  # NaN: the branch ends early
+            return q, depths
+        samples = math.ceil((samples - 1) * worst / most_mm) + 1
 
 
 MARGIN_FRACTION = 0.5

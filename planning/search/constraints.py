@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.skin import SkinPaths
 from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.arm.insertion import ReachRequest
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.progress import Count
@@ -24,7 +25,6 @@ from puncture_twin.planning.clearance.engine import MeasuredClearances
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
 from puncture_twin.planning.reach.standoff import standoffs
-from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.search.candidates import ARM_CHECKED, CONE_OF_GRID, ArmColumns, Candidates, Verdict
 
 Column = NDArray[Any] | str | float

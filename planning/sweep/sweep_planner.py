@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import ReachRequest
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose, slowed
 from puncture_twin.planning.arm.ur import UrModel
@@ -27,7 +28,6 @@ from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dens
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.standoff import standoffs
-from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 

@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, first_stop, flange_poses, needle_lines, reach_margin
+from puncture_twin.planning.arm.insertion import (
+    FULL_MARGIN_RAD,
+    ReachRequest,
+    every_branch,
+    fill_branch_path,
+    first_stop,
+    flange_poses,
+    needle_lines,
+    reach_margin,
+    surveyed,
+)
 from puncture_twin.planning.arm.inverse_kinematics import (
     EVERY_BRANCH,
     fill_branches,
@@ -15,7 +25,6 @@ from puncture_twin.planning.arm.kinematics import flange_pose, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.checker import SweptBodies
-from puncture_twin.planning.reach.survey import ReachRequest, every_branch, fill_branch_path, surveyed
 
 DEPTHS = np.linspace(0.0, 120.0, 61)
 DISTANCES = 320.0 - DEPTHS

@@ -17,7 +17,7 @@ from refusals import refused
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.insertion import needle_lines
+from puncture_twin.planning.arm.insertion import every_branch, needle_lines
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import SpeedLimits, flange_pose, jacobian, slowed
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -42,7 +42,6 @@ from puncture_twin.planning.motion.follow import follow, follow_smoothly
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
-from puncture_twin.planning.reach.survey import every_branch
 from puncture_twin.twin.jobs.patient.export_jobs import refuse_format
 
 UR3 = ur_model("ur3")

@@ -16,6 +16,7 @@ from pydicom.uid import ImplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless
 from slicer_files import vtk_model
 
 from puncture_twin.meshes import folder as embedded
+from puncture_twin.planning.arm.insertion import ReachRequest
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.output.manifest import Manifest, ManifestEntry
 from puncture_twin.planning.base.provenance import Input
@@ -27,7 +28,6 @@ from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.pictures import png_bytes
 

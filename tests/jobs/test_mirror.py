@@ -14,6 +14,7 @@ from rtde_server import PERIOD_S, START_S, rtde_server
 
 from puncture_twin import run_twin
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import ReachRequest
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
@@ -24,7 +25,6 @@ from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.geometry.spaces import Unit
 from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.live import mirror

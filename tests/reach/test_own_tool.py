@@ -11,6 +11,7 @@ import trimesh
 from case_world import CASE, write_case
 from refusals import refused
 
+from puncture_twin.planning.arm.insertion import ReachRequest
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.tool import SLABS, Box, Tool, ToolBody
 from puncture_twin.planning.arm.ur import ur_model
@@ -22,7 +23,6 @@ from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.estimate import ArmSpheres
 from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.client import physics_client
 

@@ -10,8 +10,16 @@ from case_world import write_case
 from chen2019_reach import SHARES, WINDOWS, cap, runs
 from refusals import refused
 
-from puncture_twin.planning.arm.insertion import flange_poses, needle_lines, reach_margin
-from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.insertion import (
+    MAX_SWEEP_MM,
+    ReachRequest,
+    every_branch,
+    fill_branch_path,
+    flange_poses,
+    needle_lines,
+    reach_margin,
+)
+from puncture_twin.planning.arm.inverse_kinematics import inverse, missing_reach_mm
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, flange_pose, link_poses, singularity
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -20,8 +28,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import CellChecker, SweptBodies
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.reach.reach import assess_reach_all, missing_reach_mm
-from puncture_twin.planning.reach.survey import MAX_SWEEP_MM, ReachRequest, every_branch, fill_branch_path, sampled
+from puncture_twin.planning.reach.reach import assess_reach_all, sampled
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
