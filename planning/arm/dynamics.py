@@ -1,4 +1,4 @@
-"""The dynamics of an arm by least squares: regressor, base parameters, exciting motion, and what a recording says.
+"""The dynamics of an arm by least squares: regressor, base parameters, and their estimate from a recording.
 
     tau = Y(q, qd, qdd) phi
 
@@ -106,7 +106,7 @@ def _inertia(w: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """What torques can show of an arm's parameters: Y phi = Y[:, columns] K phi, whatever the motion."""
+    """Combinations of an arm's parameters that torques determine: Y phi = Y[:, columns] K phi, whatever the motion."""
 
     columns: Ints  # shape (r,), of phi
     K: Floats  # shape (r, 78)
@@ -126,7 +126,7 @@ def base_parameters(model: UrModel, down_base: Floats, seed: int = 0) -> BasePar
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identified(Shown):
-    """What a recording says of an arm's dynamics."""
+    """Base parameters and friction of an arm, estimated from a recording."""
 
     base: BaseParameters
     values: Floats  # shape (r,), of the base parameters, kg, m, N m, s, rad
@@ -155,7 +155,7 @@ class Identified(Shown):
         return np.asarray(both.reshape(2, 6, 2))
 
     def findings(self) -> tuple[Finding, ...]:
-        """Torques that leave more than noise."""
+        """Findings where the residual torques exceed their noise."""
         most = float(self.correlated.max())
         if most == 0.0:
             return ()
@@ -258,6 +258,6 @@ def _least_squares(Y: Floats, tau: Floats, sd: Floats) -> tuple[Floats, Floats]:
 
 
 def _correlation(left: Floats) -> float:
-    """Of what is left from one row to the next; 0 where it may be chance."""
+    """Correlation of the residuals from one row to the next; 0 where it may be chance."""
     r = float(left[1:] @ left[:-1]) / max(float(left @ left), TINY)
     return min(r, 0.99) if r > 4.0 / np.sqrt(len(left)) else 0.0

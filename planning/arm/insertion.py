@@ -144,14 +144,14 @@ def surveyed(
     stops, starts = np.empty((len(lines), N_BRANCHES), np.int64), np.empty((len(lines), N_BRANCHES, 6))
     margins = np.empty((len(lines), N_BRANCHES, len(rolls)))
     turns = np.empty((len(lines), N_BRANCHES, len(rolls), 6))
-    found = []
+    surveys = []
     for i, (request, line) in enumerate(zip(requests, lines, strict=True)):
         depths = _depths(request.standoff_mm)
         distances = request.needle_length_mm + request.standoff_mm - depths
         path, filled = (*line, distances, depths), (stops[i], starts[i], margins[i], turns[i])
         _survey_line(model.lengths, model.joint_limits, *path, rolls, bounds, *filled)
-        found.append(Surveyed(request, line, depths, distances, rolls, *filled))
-    return found
+        surveys.append(Surveyed(request, line, depths, distances, rolls, *filled))
+    return surveys
 
 
 def _depths(standoff_mm: float) -> Floats:

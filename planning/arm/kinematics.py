@@ -285,7 +285,7 @@ def _singular_terms(lengths, q2, q3, q4, q5):  # type: ignore[no-untyped-def]  #
 
 @allocation_free()
 def least_term(lengths, q):  # type: ignore[no-untyped-def]  # numba infers
-    """The least of the three terms of one configuration (6,); NaN where there is none."""
+    """The least singularity term of one configuration (6,); NaN where that is not finite."""
     shoulder, elbow, wrist = _singular_terms(lengths, q[1], q[2], q[3], q[4])
     return min(shoulder, elbow, wrist) if not math.isnan(shoulder) else math.nan
 
@@ -369,7 +369,7 @@ def check_arm(
     where: str | Path,
     any_tool: bool = False,
 ) -> None:
-    """Refuse joints of another arm: ones that do not put the tool where the same file says that it was.
+    """Refuse joints that do not put the tool at the place that their own file states: they are of another arm.
 
     A UR3e's joints read as a UR3's are 18 mm off, and six angles alone do not show it. Where a recording states a point
     besides them, both must agree with the arm's nominal lengths, up to what a controller's own calibration moves.

@@ -1,4 +1,4 @@
-"""What the arm carries and what surrounds it: needle holder and needle, and the workcell's boxes."""
+"""Needle holder and needle on the flange, and the boxes of the workcell."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -104,7 +104,7 @@ SIDES = 24
 
 
 def gantry_boxes(T_base_gantry: Floats, *, bore_diameter_mm: float, wall_mm: float, depth_mm: float) -> tuple[Box, ...]:
-    """The wall about a bore.
+    """Boxes of a gantry: the wall about its bore.
 
     Args:
         T_base_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, so a tilt is a turn about x.

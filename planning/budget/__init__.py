@@ -1,4 +1,4 @@
-"""Where the next millimetre is won: what each source costs a puncture, and what a change of scan, markers or arm gains.
+"""Error budget of a puncture: the cost of each source, and the gain of other scans, markers, arms or guidance.
 
 It computes with the one error model; nothing here decides a verdict.
 """

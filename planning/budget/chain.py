@@ -105,11 +105,11 @@ class Chain:
 
     def body_mean_squares(self) -> dict[str, Floats]:
         """What the body adds, by source: shape (3, 3) each, mm^2, base axes."""
-        found = {}
+        by_source = {}
         if self.breathing is not None:  # of the target against where the CT shows it
-            moved = self.T_base_ct[:3, :3] @ self.breathing.spread_ct
-            found["breathing"] = moved @ moved.T
-        return found if self.motion_base is None else {**found, "motion": self.motion_base}
+            spread_base = self.T_base_ct[:3, :3] @ self.breathing.spread_ct
+            by_source["breathing"] = spread_base @ spread_base.T
+        return by_source if self.motion_base is None else {**by_source, "motion": self.motion_base}
 
     def expected_mm(self) -> float:
         """Expected (rms) distance of the tip from the intended point, mm."""

@@ -1,4 +1,4 @@
-"""The ways of guidance of a case along one direction: where the devices look, what has moved, how far to correct.
+"""Guidance of a case along one direction: looks of the devices, motion of the anatomy, range of corrections.
 
 A correction moves the needle parallel to itself. Part of it takes back what registration and arm had wrong; the rest
 takes the needle to another place in the body than was planned, because the target has moved there, or is there. That
@@ -54,7 +54,7 @@ LOOKS = 3
 
 
 def declared_ways(case: Case) -> tuple[str, ...]:
-    """The ways whose devices a case declares, ct first."""
+    """Names of the guidance whose devices a case declares, ct first."""
     lacking = {device for device, one in _DEVICES.items() if getattr(case, one) is None}
     return tuple(way for way, used in guided.WAYS.items() if not used & lacking)
 
@@ -64,7 +64,7 @@ _DEVICES = MappingProxyType({"cameras": "stereo", "target": "ultrasound", "tip":
 
 
 def check_way(way: str) -> None:
-    """Refuse a way that there is not."""
+    """Refuse a name of guidance that is not known."""
     if way not in guided.WAYS:
         refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(guided.WAYS), "unknown_guidance")
 
@@ -84,7 +84,7 @@ def stepped(way: str | None, steps: int | None) -> str | None:
 
 
 def ways_of(text: str) -> tuple[str, ...]:
-    """Ways of guidance in a list with commas between them, each once."""
+    """Names of guidance from a list with commas between them, each once."""
     ways = tuple(part.strip() for part in text.split(","))
     for row, way in enumerate(ways):
         check_way(way)
@@ -95,7 +95,7 @@ def ways_of(text: str) -> tuple[str, ...]:
 
 def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
     """A case with all devices of a way: undeclared ones have the reference's defaults, and a sentence each."""
-    needed, said = {_DEVICES[device] for device in guided.READS[way] if device in _DEVICES}, []
+    needed, sentences = {_DEVICES[device] for device in guided.READS[way] if device in _DEVICES}, []
     if "stereo" in needed and case.stereo is None:
         cameras = stereo_of(StereoSection(), case.space, case.path)
         assert cameras is not None
@@ -103,21 +103,23 @@ def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
         cameras = replace(cameras, balls_mm=(shaft_mm / 2.0, shaft_mm)) if short else cameras
         where = " and ".join(f"{mm:g}" for mm in cameras.balls_mm)
         why = f" (half of the shaft and the hub: the needle is {case.needle.length_mm:g} mm long)" if short else ""
-        said.append(f"[stereo] balls {where} mm behind the tip{why}, seen to {cameras.sd_mm:g} mm")
+        sentences.append(f"[stereo] balls {where} mm behind the tip{why}, seen to {cameras.sd_mm:g} mm")
         case = replace(case, stereo=cameras)
     if "ultrasound" in needed and case.ultrasound is None:
         probe = ultrasound_of(UltrasoundSection(), case.space, case.path)
         assert probe is not None
         both = "{0[0]:g} mm in the picture and {0[1]:g} mm across"
         target, tip = both.format(probe.target_sd_mm), both.format(probe.tip_sd_mm)
-        said.append(f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm")
+        sentences.append(
+            f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm"
+        )
         case = replace(case, ultrasound=probe)
     if "control_scan" in needed and case.control_scan is None:
         scan = ControlScanSection()
         cost = f"{scan.dose_msv:g} mSv and {scan.seconds:g} s each"
-        said.append(f"[control_scan] slices of {scan.slice_mm:g} mm that show the target, {cost}")
+        sentences.append(f"[control_scan] slices of {scan.slice_mm:g} mm that show the target, {cost}")
         case = replace(case, control_scan=scan)
-    return case, tuple(f"assumed: {one}" for one in said)
+    return case, tuple(f"assumed: {one}" for one in sentences)
 
 
 def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
@@ -130,14 +132,14 @@ def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What those devices see of an insertion that were asked about, and why there is no place for cameras, if so."""
+    """Views of an insertion by the queried devices, and the reason where cameras have no place."""
 
     cameras: CameraView | None = None
     probe: ProbeView | None = None
     no_cameras: str = ""
 
     def sentences(self) -> Iterator[tuple[str, str]]:
-        """What cameras and probe see, or why they do not, of those that were asked about."""
+        """Sentences on what the queried cameras and probe see, or why they see nothing."""
         if self.cameras is not None or self.no_cameras:
             yield "cameras", self.no_cameras if self.cameras is None else self.cameras.sentence
         if self.probe is not None:
@@ -145,18 +147,18 @@ class Sight:
 
     def hidden(self, out_mm: float) -> dict[str, str]:
         """What is out of sight with the tip so far from the target, by the names of readings, and why."""
-        found = {}
+        reasons = {}
         if self.probe is not None and self.probe.T_ct_image is None:
-            found = dict.fromkeys(("target", "tip"), self.probe.sentence)
+            reasons = dict.fromkeys(("target", "tip"), self.probe.sentence)
         if self.no_cameras:
-            found[guided.CAMERAS] = self.no_cameras
+            reasons[guided.CAMERAS] = self.no_cameras
         if self.cameras is not None:
             row = int(np.abs(self.cameras.tip_to_target_mm - out_mm).argmin())
             named = zip(self.cameras.names, self.cameras.hidden[row], strict=True)
             behind = {name: f"behind the {by.replace('_', ' ')}" for name, by in named if by}
             markers = [name for name in self.cameras.names[self.cameras.balls :] if name not in behind]
-            found |= behind if len(markers) >= MIN_MARKERS else {**behind, guided.CAMERAS: FEW_MARKERS}
-        return found
+            reasons |= behind if len(markers) >= MIN_MARKERS else {**behind, guided.CAMERAS: FEW_MARKERS}
+        return reasons
 
 
 FEW_MARKERS = f"fewer than {MIN_MARKERS} markers are seen"
@@ -189,7 +191,7 @@ def guided_model(
     sight: Sight | None = None,
     steps: int | None = None,
 ) -> guided.GuidedModel:
-    """What guidance knows of one insertion of a case that declares its devices.
+    """Linear model of one insertion of a case that declares its devices.
 
     Joints (6,), rad, have the tip on the target. The direction (3,), unit, is from the target along the needle, whose
     error is as rehearsed. Sight None hides nothing, and has the picture along the body. With steps a control scan is
@@ -232,7 +234,7 @@ BEYOND_TARGET_MM = 10.0
 
 
 def target_push(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Pushed | None:
-    """By how much the needle of one direction (3,), unit, pushes the target; None where its tissue does not say it."""
+    """Displacement of the target by the needle of one direction (3,), unit; None where its tissue does not say it."""
     if case.bending is None:
         return None
     length = float(case_paths(case, anatomy.skin, outward_ct[None]).path_length[0])
@@ -271,7 +273,7 @@ def _drawn_back(model: UrModel, q: Floats, outs: Sequence[float] | Floats) -> Fl
 def way_chances(
     context: CaseContext, outward_ct: Floats, q: Floats, sight: Sight | None = None
 ) -> tuple[guided.WayChance, ...]:
-    """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
+    """Expected error and chances of an insertion under each kind of guidance, ct first; none without devices.
 
     The direction (3,), unit, is from the target along the needle; joints (6,), rad, have the tip on the target; sight
     None hides nothing.
@@ -285,17 +287,17 @@ def way_chances(
     error = as_rehearsed(chance.error, touches(case, registration.markers))
     error = replace(error, bend=None if path is None else path.bend)
     model = guided_model(case, context.anatomy, error, registration, outward_ct, q, sight)
-    corridor, found = corridor_mm(case, chance, outward_ct), []
+    corridor, chances = corridor_mm(case, chance, outward_ct), []
     for way in ways:
         lost = "; ".join(lost_sight(model, way))
         try:
-            left = guided_error(model, way)
+            error_left = guided_error(model, way)
         except NoAnswerError as refused:
-            found.append(guided.WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
+            chances.append(guided.WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
             continue
-        rms_mm = float(np.sqrt(np.trace(left.tip_covariance(q[None])[0])))
-        found.append(guided.WayChance(way, rms_mm, *guided_chances(model, way, chance, corridor), lost))
-    return tuple(found)
+        rms_mm = float(np.sqrt(np.trace(error_left.tip_covariance(q[None])[0])))
+        chances.append(guided.WayChance(way, rms_mm, *guided_chances(model, way, chance, corridor), lost))
+    return tuple(chances)
 
 
 def with_ways(context: CaseContext, plan: Plan) -> Plan:
@@ -361,13 +363,13 @@ def followers(case: Case, anatomy: Anatomy) -> tuple[guided.Follows, ...]:
 
 def lost_sight(model: guided.GuidedModel, way: str) -> tuple[str, ...]:
     """What a way's devices do not see, where and why, a sentence each; that the tip is not yet in the body is none."""
-    said = []
+    sentences = []
     for look in model.looks:
         where = "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
         for what, why in look.hidden.items():
             if guided.device_of(what) in guided.READS[way] and why != OUTSIDE:
-                said.append(f"{where}: {what} out of sight: {why}")
-    return tuple(said)
+                sentences.append(f"{where}: {what} out of sight: {why}")
+    return tuple(sentences)
 
 
 OUTSIDE = "it is not in the body yet"
@@ -379,14 +381,14 @@ def guided_error(model: guided.GuidedModel, way: str, follows: guided.Follows = 
     Raises:
         NoAnswerError: What is in sight does not determine the tip against the target.
     """
-    found, one = model.guided(way), model.error
-    if found is None:
+    estimate, one = model.guided(way), model.error
+    if estimate is None:
         lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
         raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
     if follows != guided.WHOLLY:
-        cov, breath = model.left(found.gain, follows)
-        found = found._replace(cov=cov, breath=breath, tip_cov=cov[:3, :3])  # no picture shows this anatomy
-    return guided.GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
+        cov, breath = model.left(estimate.gain, follows)
+        estimate = estimate._replace(cov=cov, breath=breath, tip_cov=cov[:3, :3])  # no picture shows this anatomy
+    return guided.GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, estimate)
 
 
 PHASES = 8
@@ -415,7 +417,7 @@ def guided_chances(model: guided.GuidedModel, way: str, chance: ChanceModel, cor
 
 
 def corridor_mm(case: Case, chance: ChanceModel, outward_ct: Floats) -> float:
-    """How far from its plan a correction may take the needle in the body, mm; see the module."""
+    """Largest correction of the needle in the body away from its plan, mm; see the module."""
     lengths = case_axis_lengths(case, chance.anatomy, outward_ct[None])
     distance = chance.engine.measure(case.target_ct, outward_ct[None], lengths).distance[0][chance.columns]
     return float(max((distance - chance.breaking).min(initial=np.inf), 0.0))

@@ -141,14 +141,14 @@ def _body(chain: Chain) -> Iterator[Change]:
 
 
 def _fewer_markers(chain: Chain) -> Iterator[Change]:
-    found = []
+    changes = []
     while len(chain.points_ct) > MIN_MARKERS:
         every = np.arange(len(chain.points_ct))
-        kept = [np.delete(every, row) for row in every]
-        rest = [replace(chain, points_ct=chain.points_ct[rows], q_touch=chain.q_touch[rows]) for rows in kept]
+        remaining = [np.delete(every, row) for row in every]
+        rest = [replace(chain, points_ct=chain.points_ct[rows], q_touch=chain.q_touch[rows]) for rows in remaining]
         chain = min(rest, key=lambda one: one.expected_mm())
-        found.append(Change("markers", f"only {plural(len(chain.points_ct), 'marker')}", chain.expected_mm()))
-    yield from reversed(found)
+        changes.append(Change("markers", f"only {plural(len(chain.points_ct), 'marker')}", chain.expected_mm()))
+    yield from reversed(changes)
 
 
 def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:

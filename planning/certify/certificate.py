@@ -227,10 +227,10 @@ class Certificate(Shown):
 
     def at(self, theta: Floats, beta: Floats) -> NDArray[np.str_]:
         """Verdict letter at directions (n,) of the entry frame, rad; "" outside the cap."""
-        found = np.full(len(theta), "", dtype="U1")
+        letters = np.full(len(theta), "", dtype="U1")
         for letter in (UNDECIDED, REJECTED, PROVED_SAFE):
-            found[nearest_cell(theta, beta, self.leaves.take(self.verdict == letter)) == 0] = letter
-        return found
+            letters[nearest_cell(theta, beta, self.leaves.take(self.verdict == letter)) == 0] = letter
+        return letters
 
     def safe_cone(self, outward_ct: Floats) -> Floats:
         """Angle by which each direction (n, 3) may be off in any direction and still be proven safe, shape (n,), rad.

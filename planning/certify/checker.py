@@ -267,20 +267,20 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools
         length: Shape (k,), how far the axis goes, mm.
     """
     depth = corners @ cell.u
-    found = (depth.min(axis=1) >= limit + length) | (depth.max(axis=1) <= -limit)  # beyond the top, behind the target
+    apart = (depth.min(axis=1) >= limit + length) | (depth.max(axis=1) <= -limit)  # beyond the top, behind the target
     middle = _unit(_unit(corners.reshape(-1, 3)).reshape(corners.shape).sum(axis=1))
-    behind = np.flatnonzero(~found & (middle @ cell.u <= -np.sin(cell.rho)))
-    found[behind] = np.einsum("kci,ki->kc", corners[behind], middle[behind]).min(axis=1) >= limit[behind]
-    found |= _separated(corners, depth, limit, middle - (middle @ cell.u)[:, None] * cell.u, cell)
-    found |= _before_own_plane(corners, limit, cell, length)
-    rest = np.flatnonzero(~found) if cell.rho <= NEAR_BELOW else np.empty(0, np.int64)
+    behind = np.flatnonzero(~apart & (middle @ cell.u <= -np.sin(cell.rho)))
+    apart[behind] = np.einsum("kci,ki->kc", corners[behind], middle[behind]).min(axis=1) >= limit[behind]
+    apart |= _separated(corners, depth, limit, middle - (middle @ cell.u)[:, None] * cell.u, cell)
+    apart |= _before_own_plane(corners, limit, cell, length)
+    rest = np.flatnonzero(~apart) if cell.rho <= NEAR_BELOW else np.empty(0, np.int64)
     shifted = corners[rest] - depth[rest, :, None] * cell.u
     edge = shifted[:, [1, 2, 0]] - shifted
     part = -(shifted * edge).sum(axis=2) / np.maximum((edge * edge).sum(axis=2), 1e-300)
     feet = shifted + np.clip(part, 0, 1)[:, :, None] * edge
     for side in range(3):
-        found[rest] |= _separated(corners[rest], depth[rest], limit[rest], feet[:, side], cell)
-    return np.asarray(found)
+        apart[rest] |= _separated(corners[rest], depth[rest], limit[rest], feet[:, side], cell)
+    return np.asarray(apart)
 
 
 def _before_own_plane(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools:

@@ -1,4 +1,4 @@
-"""Cells of directions against organs: which are clear, and which come too near, by planes and by convexity.
+"""Cells of directions against organs: proofs that they are clear, or too near, by planes and by convexity.
 
 docs/concepts/certificate.md, lemmas 2 to 4. No distance is needed to prove a cell clear: a plane that keeps a triangle
 at the limit from every axis of the cell is proof enough, however it was found.

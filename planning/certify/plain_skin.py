@@ -108,7 +108,7 @@ def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
         if len(set(face)) == 3:
             for p, q in zip(face, face[1:] + face[:1], strict=True):
                 sides[min(p, q), max(p, q)].append(s if p < q else -s)  # seen from one end to the other
-    regular = {edge for edge, found in sides.items() if sorted(found) == [-1, 1]}
+    regular = {edge for edge, directions in sides.items() if sorted(directions) == [-1, 1]}
     return np.array(
         [
             [len(set(f)) == 3 and (min(p, q), max(p, q)) not in regular for p, q in zip(f, f[1:] + f[:1], strict=True)]
@@ -163,7 +163,7 @@ def _pierced(corners: Floats, ray: Floats) -> Ints:
     rounding = 1e-11 * np.roll(lengths, -1, axis=1) * np.roll(lengths, -2, axis=1)
     left, right = (weights > rounding).any(axis=1), (weights < -rounding).any(axis=1)
     ahead = np.einsum("nc,nci,i->n", weights, corners, ray)
-    found = np.where((ahead > 0) == left, 1, 0)
-    found[(np.abs(weights) <= rounding).any(axis=1)] = -1
-    found[left & right] = 0
-    return found
+    crossed = np.where((ahead > 0) == left, 1, 0)
+    crossed[(np.abs(weights) <= rounding).any(axis=1)] = -1
+    crossed[left & right] = 0
+    return crossed

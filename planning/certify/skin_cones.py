@@ -168,14 +168,14 @@ def skin_bounds(
     A ray (n, 3) inside each cell is tested. ``length`` is the needle's, tip to flange, the longest path no longer; mm.
     """
     n = len(centres)
-    found = SkinBounds(
+    bounds = SkinBounds(
         np.full(n, -1), np.zeros(n, bool), np.full(n, np.inf), np.zeros(n), np.full(n, np.pi / 2), np.zeros(n)
     )
     zone = surface.zones
     skin = surface.corners, surface.normals, surface.fold, surface.cut, zone.nearest, zone.farthest
     cones = np.ascontiguousarray(centres), radius + CONE_PAD_RAD, np.ascontiguousarray(rays)
-    _bound(*skin, lists.start, lists.items, *cones, length, longest, tuple(vars(found).values()))
-    return found
+    _bound(*skin, lists.start, lists.items, *cones, length, longest, tuple(vars(bounds).values()))
+    return bounds
 
 
 @nb.njit(cache=True)

@@ -87,8 +87,8 @@ def certify(
     low_high, first_last, verdict, code, triangle, bound = map(np.concatenate, zip(*leaves, strict=True))
     reason = np.array([reason.value for reason in REASONS], dtype=np.str_)[code]
     structure, face = evaluator.names(triangle)
-    found = Cells(low_high, first_last), verdict, reason, structure, face, bound
-    return Certificate(question, size, tuple(tree), *found, evaluator.queries)
+    of_leaves = Cells(low_high, first_last), verdict, reason, structure, face, bound
+    return Certificate(question, size, tuple(tree), *of_leaves, evaluator.queries)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,15 +181,15 @@ class _Evaluator:
     def _near(self, part: int, verdicts: _Verdicts, cones: Cones, state: _State, lengths: Floats) -> Lists:
         """Reject cells by structures within the body (0) or outside of it (1); the lists that matter to their parts."""
         witness, pad = state.witness[part], CLEARANCE_PAD_MM
-        found = organ_facts(
+        facts = organ_facts(
             self._organs[part], state.organs[part], state.parent, witness, cones, lengths, wide=MEASURE_BELOW, pad=pad
         )
-        self.queries += found.measured
-        first, fresh = part * len(self._organs[0].group), found.rejected & (verdicts.letter == UNDECIDED)
-        verdicts.reject(fresh, Reason.TOO_CLOSE, found.largest - self._question.radius)
-        verdicts.triangle[fresh] = found.witness[fresh] + first
-        verdicts.state.witness[part] = found.witness
-        return found.near
+        self.queries += facts.measured
+        first, fresh = part * len(self._organs[0].group), facts.rejected & (verdicts.letter == UNDECIDED)
+        verdicts.reject(fresh, Reason.TOO_CLOSE, facts.largest - self._question.radius)
+        verdicts.triangle[fresh] = facts.witness[fresh] + first
+        verdicts.state.witness[part] = facts.witness
+        return facts.near
 
     def names(self, triangle: Ints) -> tuple[NDArray[np.str_], Ints]:
         """The structure of each triangle, and which of its triangles it is; "" and -1 for -1."""
@@ -202,7 +202,7 @@ class _Evaluator:
         rows = np.flatnonzero((verdicts.letter == UNDECIDED) & which)
         if not len(rows):
             return
-        found = skin_bounds(
+        bounds = skin_bounds(
             self._skin,
             state.skin.take(rows),
             cones.centres[rows],
@@ -212,21 +212,21 @@ class _Evaluator:
             longest=question.longest,
         )
         state.skin_good[rows] |= (
-            (found.count == 1)
-            & ~found.cut
-            & (found.farthest <= question.longest - DEPTH_PAD_MM)
-            & (found.largest_angle <= question.max_skin_angle - ANGLE_PAD_RAD)
+            (bounds.count == 1)
+            & ~bounds.cut
+            & (bounds.farthest <= question.longest - DEPTH_PAD_MM)
+            & (bounds.largest_angle <= question.max_skin_angle - ANGLE_PAD_RAD)
         )
         n = len(cells)
-        none_near = found.least_skin > question.longest + DEPTH_PAD_MM
-        steep = ~none_near & (found.least_angle > question.max_skin_angle + ANGLE_PAD_RAD)
-        nearest = np.where(np.isfinite(found.least_skin), found.least_skin, np.nan)
-        verdicts.reject(_spread(none_near & found.cut, rows, n), Reason.UNKNOWN_REGION)
+        none_near = bounds.least_skin > question.longest + DEPTH_PAD_MM
+        steep = ~none_near & (bounds.least_angle > question.max_skin_angle + ANGLE_PAD_RAD)
+        nearest = np.where(np.isfinite(bounds.least_skin), bounds.least_skin, np.nan)
+        verdicts.reject(_spread(none_near & bounds.cut, rows, n), Reason.UNKNOWN_REGION)
         verdicts.reject(_spread(none_near, rows, n), Reason.TOO_LONG, _spread(nearest, rows, n))
-        verdicts.reject(_spread(found.count > 1, rows, n), Reason.REENTERS_SKIN)
-        angle = np.degrees(found.least_angle)
+        verdicts.reject(_spread(bounds.count > 1, rows, n), Reason.REENTERS_SKIN)
+        angle = np.degrees(bounds.least_angle)
         verdicts.reject(_spread(steep, rows, n), Reason.SKIN_ANGLE, _spread(angle, rows, n))
-        flange, known = flange_bounds(self._needle, question, found), state.flange
+        flange, known = flange_bounds(self._needle, question, bounds), state.flange
         known[rows, 0] = np.maximum(known[rows, 0], flange[:, 0])
         known[rows, 1] = np.minimum(known[rows, 1], flange[:, 1])
 

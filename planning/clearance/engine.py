@@ -1,4 +1,4 @@
-"""Needle-to-organ clearance: the interface of clearance engines, and what holds whichever engine measures.
+"""Needle-to-organ clearance: the interface of clearance engines, and margins and normals by any of them.
 
 An engine gives the distance of needle axes from surfaces. `measure` makes clearances of them, and says which violate a
 margin (FCL decides ties); `normals_of` gives the unit vectors from the nearest triangles.

@@ -1,4 +1,4 @@
-"""Verdicts of a grid of directions without distances: which structure is the first whose margin a needle breaks.
+"""Verdicts of a grid of directions without distances: the first structure whose margin a needle breaks.
 
 A needle of direction u from the target comes within r of a sphere (centre c from the target, radius R) only if
 

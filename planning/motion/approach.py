@@ -160,18 +160,18 @@ def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
     return cuts
 
 
-def _why_none(found: Connected, ends: _Ends, seed: int) -> str:
+def _why_none(run: Connected, ends: _Ends, seed: int) -> str:
     cut, n_goals, n_free = ends.cut, len(ends.goals), len(ends.open_goals)
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
     n_off = int(cut.off.sum())
     if n_off == n_free:
         return f"approach proven impossible: {cut.text}{busy}"
-    where = "the goals are" if found.goal_states <= found.home_states else "home is"
-    trees = f"{found.home_states} states joined home, {found.goal_states} the goals"
-    total = sum(found.blocked.values())
-    most = [f"{c.body} touches {c.other} ({n} of {total})" for c, n in Counter(found.blocked).most_common(2)]
+    where = "the goals are" if run.goal_states <= run.home_states else "home is"
+    trees = f"{run.home_states} states joined home, {run.goal_states} the goals"
+    total = sum(run.blocked.values())
+    most = [f"{c.body} touches {c.other} ({n} of {total})" for c, n in Counter(run.blocked).most_common(2)]
     proven = f"; {n_off} of {n_free} goals are proven to be cut off" if n_off else ""
     return (
-        f"approach unknown after {found.samples} samples (seed {seed}): {where} in a part of the space that the "
+        f"approach unknown after {run.samples} samples (seed {seed}): {where} in a part of the space that the "
         f"search did not reach: {trees}; most frequent contacts: {', '.join(most) or 'nothing'}{proven}{busy}"
     )

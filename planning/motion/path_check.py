@@ -86,10 +86,10 @@ class _Path:
         for body in DISTANCE_PAIRS[pair] if np.isfinite(best.mm) else ():
             at = self._checker.next_nearer(motion, 0, pair, body, best.mm - CLEARANCE_STEP_MM)
             while at >= 0:
-                here = self._checker.nearest(self._q[at], pair, body)
-                best = min(best, here)
+                distance = self._checker.nearest(self._q[at], pair, body)
+                best = min(best, distance)
                 moved = self._moved[body]
-                at = int(np.searchsorted(moved, moved[at] + here.mm - best.mm + CLEARANCE_STEP_MM))
+                at = int(np.searchsorted(moved, moved[at] + distance.mm - best.mm + CLEARANCE_STEP_MM))
                 if at >= len(moved):
                     break
                 at = self._checker.next_nearer(motion, at, pair, body, best.mm - CLEARANCE_STEP_MM)
@@ -101,17 +101,17 @@ class _Path:
         last, best = len(self._q) - 1, Nearest(np.inf, "", "")
         for body in DISTANCE_PAIRS[pair]:
             ends = [(at, self._checker.nearest(self._q[at], pair, body)) for at in (0, last)]
-            best = min(best, *(here for _, here in ends))
-            self._push(stretches, body, *((at, here.mm) for at, here in ends))
+            best = min(best, *(distance for _, distance in ends))
+            self._push(stretches, body, *((at, distance.mm) for at, distance in ends))
         while stretches and stretches[0][0] < best.mm - tolerance_mm:
             _, body, first, second = heappop(stretches)
             moved = self._moved[body]
             lowest = (moved[first[0]] + moved[second[0]] + first[1] - second[1]) / 2.0
             at = int(np.clip(np.searchsorted(moved, lowest), first[0] + 1, second[0] - 1))
-            here = self._checker.nearest(self._q[at], pair, body)
-            best = min(best, here)
-            self._push(stretches, body, first, (at, here.mm))
-            self._push(stretches, body, (at, here.mm), second)
+            distance = self._checker.nearest(self._q[at], pair, body)
+            best = min(best, distance)
+            self._push(stretches, body, first, (at, distance.mm))
+            self._push(stretches, body, (at, distance.mm), second)
         return best
 
     def _push(self, stretches: list[_Stretch], body: str, first: _At, second: _At) -> None:

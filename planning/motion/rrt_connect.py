@@ -92,8 +92,8 @@ def connect(
         none = Connected(None, -1, of_home, of_goals, validator.samples, validator.blocked)
         if not problem.hasExactSolution():
             return none
-        found = np.array([angles_of(state) for state in problem.getSolutionPath().getStates()])
-        waypoints, goal_index = _with_exact_ends(found, home, goals)
+        states = np.array([angles_of(state) for state in problem.getSolutionPath().getStates()])
+        waypoints, goal_index = _with_exact_ends(states, home, goals)
         waypoints = shortened(limits.bounds, clear_of or contact_of, waypoints)
     return none._replace(waypoints=_with_exact_ends(waypoints, home, goals)[0], goal_index=goal_index)
 

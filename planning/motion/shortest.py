@@ -60,7 +60,7 @@ class Task(NamedTuple):
     contact_of: SegmentContact
     home: Floats  # shape (6,), rad, free
     goals: Floats  # shape (g, 6), rad, free
-    cut: Cut | None = None  # tells which of the goals are cut off from home
+    cut: Cut | None = None  # the proof of which goals are cut off from home
     clear_of: SegmentContact | None = None  # checks a shortcut; None for the check of a segment
 
 
@@ -71,8 +71,8 @@ def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path
     need not be known.
     """
     away = _distances(home, goals)
-    found = _straight(contact_of, home, goals, away)
-    return found if found is not None and min(away) * SHORT_ENOUGH >= found.length else None
+    path = _straight(contact_of, home, goals, away)
+    return path if path is not None and min(away) * SHORT_ENOUGH >= path.length else None
 
 
 def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> Path | Connected:
@@ -88,11 +88,11 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
         sought = [goal for goal, straight in enumerate(away) if straight * SHORT_ENOUGH < enough]  # worth a run
         if not sought:
             break
-        found = _run(task._replace(goals=task.goals[sought]), best, seed + run, max_samples)
-        if found.waypoints is None:
-            return found if best is None else best
-        max_samples = min(max_samples, max(LEAST_SAMPLES, PATIENCE * found.samples))
-        path = Path(found.waypoints, sought[found.goal_index])
+        connected = _run(task._replace(goals=task.goals[sought]), best, seed + run, max_samples)
+        if connected.waypoints is None:
+            return connected if best is None else best
+        max_samples = min(max_samples, max(LEAST_SAMPLES, PATIENCE * connected.samples))
+        path = Path(connected.waypoints, sought[connected.goal_index])
         best = path if best is None or path.length < best.length else best
     assert best is not None  # the first run has returned without one
     return best
@@ -195,11 +195,11 @@ class Cut:
         origins, axes = poses[:, None, :2, :3, 3], poses[:, None, :2, :3, 2]
         levers = np.moveaxis(np.linalg.norm(np.cross(points[:, :, None] - origins, axes), axis=-1), -1, 0)
         moved = halves[1] * levers[1] + halves[0] * (levers[0] + halves[1] * levers[1])
-        found = np.full(len(points), -1)
+        blocking = np.full(len(points), -1)
         for row, box in enumerate(self._boxes):
             inside = np.asarray(box.size_mm) / 2.0 - np.abs(apply(inverse(box.T_base_box), points))
-            found[(inside.min(axis=-1) > moved + SLACK_MM).any(axis=1)] = row
-        return found.reshape(len(first), len(second))[first_rows][:, second_rows]
+            blocking[(inside.min(axis=-1) > moved + SLACK_MM).any(axis=1)] = row
+        return blocking.reshape(len(first), len(second))[first_rows][:, second_rows]
 
     @cached_property
     def _parts(self) -> Ints:

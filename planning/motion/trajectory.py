@@ -63,9 +63,9 @@ class Trajectory:
         steps = np.diff(self.times_s)
         before, after = steps[0] * np.arange(-3, 0), self.times_s[-1] + steps[-1] * np.arange(1, 4)
         times = np.concatenate([before, self.times_s, after])
-        rates, found = np.concatenate([self.q[:1]] * 3 + [self.q] + [self.q[-1:]] * 3), []
+        rates, peaks = np.concatenate([self.q[:1]] * 3 + [self.q] + [self.q[-1:]] * 3), []
         for _ in Peaks._fields:
             rates = np.diff(rates, axis=0) / np.diff(times)[:, None]
             times = (times[:-1] + times[1:]) / 2.0
-            found.append(np.abs(rates).max(axis=0))
-        return Peaks(*found)
+            peaks.append(np.abs(rates).max(axis=0))
+        return Peaks(*peaks)

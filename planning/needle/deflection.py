@@ -56,8 +56,8 @@ class DeflectionBound:
         """
         length = np.asarray(path_length, dtype=np.float64)
         row = np.searchsorted(self.depth_mm, np.nan_to_num(length))
-        found = np.append(self.bevel_mm, np.inf)[np.minimum(row, len(self.bevel_mm))] + self.sag_mm  # inf past the end
-        return np.asarray(np.where(np.isnan(length), np.nan, found))
+        bounds = np.append(self.bevel_mm, np.inf)[np.minimum(row, len(self.bevel_mm))] + self.sag_mm  # inf past the end
+        return np.asarray(np.where(np.isnan(length), np.nan, bounds))
 
 
 def deflection_bound(shaft: Shaft, alpha: float, tissues: Iterable[Tissue], longest_mm: float) -> DeflectionBound:
@@ -139,10 +139,11 @@ class Beam:
         right[at + 1] -= free[1, at] * tip_mm
         clamped[1:, at] = 0.0
         clamped[0, at], right[at] = 1.0, tip_mm
-        found = scipy.linalg.solveh_banded(clamped, right, lower=True, check_finite=False)
-        row = sum(free[below, at - below] * found[at - below] for below in range(1, BANDS))
-        force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]  # the row that was replaced
-        return _shape(found, float(force), (bands, load))
+        solution = scipy.linalg.solveh_banded(clamped, right, lower=True, check_finite=False)
+        row = sum(free[below, at - below] * solution[at - below] for below in range(1, BANDS))
+        # the row that was replaced
+        force = row + free[0, at] * solution[at] + free[1, at] * solution[at + 1] - load[-2]
+        return _shape(solution, float(force), (bands, load))
 
     def _bands(self, foundation: Floats) -> Floats:
         """The stiffness matrix in lower banded form, shape (BANDS, 2 (elements + 1))."""
@@ -159,12 +160,12 @@ class Beam:
         return bands
 
 
-def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
+def _shape(solution: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
     """The shape with the clamped node in front, whose two rows give the clamp's reaction."""
     bands, load = system
-    bears = load[0] - bands[2, 0] * found[0] - bands[3, 0] * found[1]
-    moment = load[1] - bands[1, 1] * found[0] - bands[2, 1] * found[1]
-    shape = np.concatenate([[0.0], found[0::2]]), np.concatenate([[0.0], found[1::2]])
+    bears = load[0] - bands[2, 0] * solution[0] - bands[3, 0] * solution[1]
+    moment = load[1] - bands[1, 1] * solution[0] - bands[2, 1] * solution[1]
+    shape = np.concatenate([[0.0], solution[0::2]]), np.concatenate([[0.0], solution[1::2]])
     return Shape(*shape, force, float(bears), float(moment))
 
 

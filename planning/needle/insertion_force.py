@@ -1,4 +1,4 @@
-"""The axial force of an insertion: capsules, cutting and friction, and where the arm's work goes.
+"""The axial force of an insertion by capsules, cutting and friction, and the arm's work by each.
 
 After Okamura, Simone and O'Leary (IEEE Trans. Biomed. Eng. 51, 2004): before a surface ruptures it is a nonlinear
 spring; behind it a constant cutting force and friction along the shaft. The spring's form is ours, F = P (x / d)^2 up
@@ -73,7 +73,7 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
 
 
 class Pushed(NamedTuple):
-    """By how much the tissue about the target is pushed on along the needle."""
+    """Displacement of the tissue about the target along the needle."""
 
     depth_mm: Floats  # shape (n,), of the tip from the skin
     shift_mm: Floats  # shape (n,)
@@ -101,10 +101,10 @@ def pushed(layers: Sequence[Layer], target_mm: float) -> Pushed | None:
 
 def _pushes(layers: Sequence[Layer], end: float) -> list[Push]:
     """Capsules in order; what lies within the reach of one that ruptures goes with it. The target ends the last."""
-    found: list[Push] = []
+    pushes: list[Push] = []
     for layer in layers:
-        tissue, inside = layer.tissue, found[-1].end_mm if found else 0.0
+        tissue, inside = layer.tissue, pushes[-1].end_mm if pushes else 0.0
         if tissue.capsule_n > 0 and tissue.capsule_mm > 0 and layer.start_mm >= inside:
             reach = tissue.capsule_mm
-            found.append(Push(layer.start_mm, min(layer.start_mm + reach, end), tissue.capsule_n, reach))
-    return found
+            pushes.append(Push(layer.start_mm, min(layer.start_mm + reach, end), tissue.capsule_n, reach))
+    return pushes

@@ -1,4 +1,4 @@
-"""The chosen pose and its motion: what is rehearsed, exported and stored; what it touches, and how near it comes."""
+"""The chosen pose and its motion: the value that is rehearsed, exported and stored, its contacts and clearances."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -97,12 +97,12 @@ CLEARANCE_TEXT = MappingProxyType(
 
 
 def phase_clearances(plan: Plan, checker: CellChecker) -> dict[str, float]:
-    """How near arm and holder come to patient and workcell in each phase of the stored motion; mm."""
-    found = {}
+    """Least distance of arm and holder from patient and workcell in each phase of the motion; mm."""
+    clearances = {}
     for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
         least = least_clearance(checker, dense_states(checker, part.q, RESOLUTION_RAD / FINER))
-        found[phase] = min(least.patient.mm, least.boxes.mm)
-    return found
+        clearances[phase] = min(least.patient.mm, least.boxes.mm)
+    return clearances
 
 
 def motion_contact(plan: Plan, checker: CellChecker) -> str | None:

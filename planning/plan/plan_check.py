@@ -1,4 +1,4 @@
-"""Whether a plan does what it says, is still its case's, and is free of contact; and how its file states an arm."""
+"""Checks of a plan: motion, inputs of its case, contacts, labels; and the arm's numbers in its file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +63,7 @@ def check_inputs(plan: Plan, case: Case, path: Path) -> None:
 
 
 def check_geometry(plan: Plan, path: Path) -> None:
-    """Refuse a plan whose motion does not do what it says: join, start at standoff, end on the target."""
+    """Refuse a plan whose motion has a gap, starts elsewhere than at standoff, or ends off the target."""
     if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
         refuse("the insertion does not start where the approach ends", path, "connected phases", "phases_not_joined")
     _check_straight(plan, path)
@@ -83,13 +83,13 @@ def check_geometry(plan: Plan, path: Path) -> None:
 
 
 def check_angles(plan: Plan, path: Path) -> None:
-    """Refuse a roll that is not that of the joint angles at standoff, and angles beyond their turn."""
+    """Refuse a roll that is not that of the joint angles at standoff, and angles beyond a full circle."""
     for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
         if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
             refuse(f"{name} = {np.degrees(angle):g}", path, f"0 to {np.degrees(turn):g}", "out_of_range")
     roll = roll_of(plan)
-    off = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
-    if off > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
+    difference = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
+    if difference > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
         what = f"roll_deg is {np.degrees(plan.roll):g}, but the joint angles at standoff give {np.degrees(roll):.4g}"
         refuse(what, path, "plan again", "plan_contradicted")
 
@@ -286,16 +286,16 @@ def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path
         ("speed_limits", plan.speeds, case.robot.speeds),
         ("the approach's first row", plan.approach.q[0], home_configuration(case)),
     )
-    for name, said, known in stated:
-        _check_same(name, said, known, path)
+    for name, stated_value, known in stated:
+        _check_same(name, stated_value, known, path)
 
 
-def _check_same(name: str, said: Any, known: Any, path: Path) -> None:
-    """Refuse a stated number that is another when it is computed again; in a file, no number is null."""
+def _check_same(name: str, stated: Any, known: Any, path: Path) -> None:
+    """Refuse a stated number that differs from the computed one; in a file, no number is null."""
     if isinstance(known, str | int):
-        same = said == known
+        same = stated == known
     else:
-        said, known = (np.where(np.isfinite(value), value, np.nan) for value in (said, known))
-        same = np.allclose(said, known, rtol=0, atol=SAME_NUMBER_MM, equal_nan=True)
+        stated, known = (np.where(np.isfinite(value), value, np.nan) for value in (stated, known))
+        same = np.allclose(stated, known, rtol=0, atol=SAME_NUMBER_MM, equal_nan=True)
     if not same:
-        refuse(f"{name} is {said}, but the case gives {known}", path, "plan again", "plan_of_another")
+        refuse(f"{name} is {stated}, but the case gives {known}", path, "plan again", "plan_of_another")

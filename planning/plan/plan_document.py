@@ -124,10 +124,10 @@ def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
             refuse(f"the times of the {phase} are not even", path, f"one row every {SAMPLE_S} s", "times_uneven")
 
 
-def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
+def _same_rates(stated: Any, known: dict[str, list[float]]) -> bool:
     try:
-        return set(said) == set(known) and all(
-            np.allclose(array(said[rate], (6,)), known[rate], rtol=SAME_PEAK, atol=SAME_PEAK) for rate in known
+        return set(stated) == set(known) and all(
+            np.allclose(array(stated[rate], (6,)), known[rate], rtol=SAME_PEAK, atol=SAME_PEAK) for rate in known
         )
     except (TypeError, ValueError):
         return False
@@ -176,11 +176,11 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         clearance_mm=field(document, "clearance_mm", _clearances),
         speeds=field(document, "speed_limits", _speed_limits),
         warnings=field(document, "warnings", texts),
-        guidance=tuple(_way(one) for one in document.get("guidance", [])),
+        guidance=tuple(_way_chance(one) for one in document.get("guidance", [])),
     )
 
 
-def _way(value: Any) -> WayChance:
+def _way_chance(value: Any) -> WayChance:
     error, hit, stop = (field(value, name, number_or_nan) for name in ("expected_error_mm", "p_hit", "p_stop"))
     return WayChance(field(value, "way", text), error, hit, stop, field(value, "lost_sight", text))
 

@@ -42,7 +42,7 @@ from puncture_twin.planning.collision.checker import CellChecker, SweptBodies, m
 
 @dataclass(frozen=True, eq=False)
 class ReachAnswer:
-    """Whether and how the arm reaches along one direction."""
+    """Answer to a reach request: the insertion, or the reason why there is none."""
 
     reachable: bool
     reason: Reason
@@ -72,20 +72,20 @@ class ReachAnswer:
         self.insertion_depth_mm.setflags(write=False)
 
 
-def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAnswer:
+def refusal(model: UrModel, survey: Surveyed, deepest: Blocked | None) -> ReachAnswer:
     """The refusal of a request without a clear motion: ``deepest`` blocked the one that came farthest, if any began."""
     if deepest is not None and deepest.at_standoff:
         return ReachAnswer.refused(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
     if deepest is not None:
         return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
-    if (found.stop_at < 0).any():
+    if (survey.stop_at < 0).any():
         return ReachAnswer.refused(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
-    reached = away_from_singularities(model, found.starts)
+    reached = away_from_singularities(model, survey.starts)
     if not reached.any():
-        T_base_flange = flange_poses(found.line.target, found.line.outward, found.distances[0])
+        T_base_flange = flange_poses(survey.line.target, survey.line.outward, survey.distances[0])
         return ReachAnswer.refused(Reason.UNREACHABLE, None, why_unreachable(model, T_base_flange[0]))
-    paths = every_branch(model, found.line, found.distances)
-    stops = [first_stop(model, path, found.depths) for path in paths[reached]]
+    paths = every_branch(model, survey.line, survey.distances)
+    stops = [first_stop(model, path, survey.depths) for path in paths[reached]]
     farthest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
     return ReachAnswer.refused(Reason.INSERTION_BLOCKED, farthest.depth_mm, farthest.detail)
 
@@ -118,11 +118,11 @@ def assess_reach_all(
 
 def every_reach(checker: CellChecker, request: ReachRequest) -> list[ReachAnswer]:
     """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first."""
-    found = _surveyed(checker, [request], ROLLS)[0]
-    motions = [*found.insertions()]
+    survey = _surveyed(checker, [request], ROLLS)[0]
+    motions = [*survey.insertions()]
     standoffs = np.array([insertion.standoff for insertion in motions]).reshape(-1, 6)
     contacts = checker.contacts(standoffs, needle_may_touch_patient=False)
-    answers = (tried(checker, found, *pair) for pair in zip(motions, contacts, strict=True))
+    answers = (check_motion(checker, survey, *pair) for pair in zip(motions, contacts, strict=True))
     return [answer for answer in answers if isinstance(answer, ReachAnswer)]
 
 
@@ -136,8 +136,8 @@ def _answers(checker: CellChecker, requests: Sequence[ReachRequest], n_rolls: in
     while search.goes_on:
         search.try_next()
     return [
-        refusal(checker.model, found, deepest) if answer is None else answer
-        for found, answer, deepest in zip(surveys, search.answers, search.deepest, strict=True)
+        refusal(checker.model, survey, deepest) if answer is None else answer
+        for survey, answer, deepest in zip(surveys, search.answers, search.deepest, strict=True)
     ]
 
 
@@ -188,9 +188,9 @@ class FirstClear:
         for row, branch, roll, standoff, contact in zip(
             rows.tolist(), branches.tolist(), rolls.tolist(), standoffs, contacts, strict=True
         ):
-            found = self._surveyed[row]
-            motion = Insertion(found.line, branch, float(found.rolls[roll]), found.turns[branch, roll], standoff)
-            result = tried(self._checker, found, motion, contact)
+            survey = self._surveyed[row]
+            motion = Insertion(survey.line, branch, float(survey.rolls[roll]), survey.turns[branch, roll], standoff)
+            result = check_motion(self._checker, survey, motion, contact)
             if isinstance(result, ReachAnswer):
                 self.answers[row] = result
                 self._left[row] = False
@@ -209,11 +209,11 @@ class FirstClear:
         its answer nor what was deepest.
         """
         rows, at = np.nonzero(self._left)
-        left = np.zeros(self._starts.shape[:2], np.bool_)
-        left[rows, self._branches[rows, at]] = True
-        branches, rows = np.nonzero(left.T)  # neighbours in turn: what is proven of one is nearly proven of the next
-        left[rows, branches] = ~self._checker.folded(self._starts[rows, branches] + self._turns[rows, branches, 0])
-        self._left &= np.take_along_axis(left, self._branches, axis=1)
+        usable = np.zeros(self._starts.shape[:2], np.bool_)
+        usable[rows, self._branches[rows, at]] = True
+        branches, rows = np.nonzero(usable.T)  # neighbours follow one another: one proof nearly holds for the next
+        usable[rows, branches] = ~self._checker.folded(self._starts[rows, branches] + self._turns[rows, branches, 0])
+        self._left &= np.take_along_axis(usable, self._branches, axis=1)
 
 
 ROLL_BODIES = frozenset({"wrist_3", "tool"})
@@ -230,17 +230,17 @@ class Blocked(NamedTuple):
     contact: Contact | None = None
 
 
-def tried(
-    checker: CellChecker, found: Surveyed, insertion: Insertion, contact: Contact | None
+def check_motion(
+    checker: CellChecker, survey: Surveyed, insertion: Insertion, contact: Contact | None
 ) -> ReachAnswer | Blocked:
     """The answer that one motion gives, by its contact at the standoff and the contacts on its way to the target."""
     if contact is not None:
         detail = f"{contact.body} touches {contact.other} at standoff"
         return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
     model = checker.model
-    lengths = found.request.needle_length_mm, found.request.standoff_mm
-    line, branch, roll, turn, _ = insertion
-    q, depths = sampled(checker.swept, line, branch, turn, lengths, len(found.depths), MAX_SWEEP_MM)
+    lengths = survey.request.needle_length_mm, survey.request.standoff_mm
+    line, branch, roll, rotation, _ = insertion
+    q, depths = sampled(checker.swept, line, branch, rotation, lengths, len(survey.depths), MAX_SWEEP_MM)
     stop = first_stop(model, q, depths)
     if stop is not None:
         return Blocked(stop.depth_mm, stop.detail)
@@ -259,7 +259,7 @@ def sampled(
     swept: SweptBodies,
     line: NeedleLine,
     branch: int,
-    turn: Floats,
+    rotation: Floats,
     lengths_mm: tuple[float, float],
     samples: int,
     most_mm: float,
@@ -276,7 +276,7 @@ def sampled(
         most_mm: What no body's motion exceeds; see :meth:`SweptBodies.bounds_mm`.
     """
     bodies = swept.corners, swept.longest_lever_mm
-    q, depths = _sampled(swept.model.lengths, *line, branch, turn, lengths_mm, samples, bodies, most_mm)
+    q, depths = _sampled(swept.model.lengths, *line, branch, rotation, lengths_mm, samples, bodies, most_mm)
     return q, depths
 
 
@@ -318,10 +318,10 @@ def approach_goals(checker: CellChecker, request: ReachRequest, q_home: Floats) 
     least = MARGIN_FRACTION * max((answer.margin for answer in reached), default=0.0)
     every = [rotated for answer in reached for rotated in _rotated(checker, answer) if rotated.margin >= least]
     every.sort(key=lambda answer: float(np.linalg.norm(answer.insertion_q[0] - q_home)))
-    kept: dict[int, list[ReachAnswer]] = {}
+    by_branch: dict[int, list[ReachAnswer]] = {}
     for answer in every:
-        kept.setdefault(answer.branch, []).append(answer)
-    chosen = {id(answer) for branch in kept.values() for answer in branch[:NEAREST]}
+        by_branch.setdefault(answer.branch, []).append(answer)
+    chosen = {id(answer) for branch in by_branch.values() for answer in branch[:NEAREST]}
     return [answer for answer in every if id(answer) in chosen]
 
 

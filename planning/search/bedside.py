@@ -126,7 +126,7 @@ def entry_facts(
 
 
 class NeedlePlanes(NamedTuple):
-    """Angles of one needle, rad."""
+    """Angles of one needle in the scanner, rad."""
 
     in_plane: float
     """Between the patient's front and the needle as it is seen in the axial slice, -π..π; positive: the hub is on the
@@ -203,11 +203,11 @@ class EntryPlace:
 
     @property
     def distance_mm(self) -> float:
-        """Straight through the air."""
+        """Distance of the entry from the landmark, straight through the air."""
         return float(np.linalg.norm(self.offset_ct))
 
     def text(self, space: Space) -> str:
-        """Such as "52 mm to the right and 32 mm toward the feet of marker A"."""
+        """Place relative to the landmark, such as "52 mm to the right and 32 mm toward the feet of marker A"."""
         axes = LOCAL if space is Space.LOCAL else PATIENT
         parts = [
             f"{abs(mm):.0f} mm {positive if mm > 0 else negative}"

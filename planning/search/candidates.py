@@ -96,7 +96,7 @@ class Path(Columns):
 
 @dataclass(frozen=True, eq=False)
 class ClearanceColumns(Columns):
-    """How far the needle's surface stays from each of k structures, mm."""
+    """Clearances of the needle's surface from k structures, mm."""
 
     structures: tuple[str, ...]
     margins: Floats
@@ -237,7 +237,7 @@ class Windows(Shown):
 
     @property
     def headline(self) -> str:
-        """One sentence on how much is safe."""
+        """One sentence on the largest window."""
         one = self.largest
         if one is None:
             return "no window: nothing is safe"
@@ -248,7 +248,7 @@ class Windows(Shown):
         yield "largest", "–" if self.largest is None else self.largest.text
 
     def rows(self, number: int) -> Ints:
-        """The candidates of one window."""
+        """Rows of the candidates in one window."""
         return np.flatnonzero(self.of_row == number)
 
 

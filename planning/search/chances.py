@@ -179,14 +179,14 @@ def refined_chances(
 
 def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
     """Whether needles, as of `ChanceModel.chances`, satisfy the limits in any configuration at the target: (n,)."""
-    kept, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
+    satisfied, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
     if least is not None:
-        kept &= model.hit_chance(model.error.covariance_ct(q)) >= least
+        satisfied &= model.hit_chance(model.error.covariance_ct(q)) >= least
     if not np.isfinite(limits).any():
-        return kept
+        return satisfied
     first = model.chances(outward_ct, q)
     touch = refined_chances(model, outward_ct, q, first, np.broadcast_to(np.isfinite(limits), first.touch.shape)).touch
-    return np.asarray(kept & (np.where(np.isnan(touch), np.inf, touch) <= limits).all(axis=1))
+    return np.asarray(satisfied & (np.where(np.isnan(touch), np.inf, touch) <= limits).all(axis=1))
 
 
 def demanding(structures: tuple[Structure, ...]) -> Ints:

@@ -1,4 +1,4 @@
-"""Which candidate a person wants: the best, one of a rank or window, of two angles, or of an entry into the skin.
+"""Choice of a candidate by a person: the best, one of a rank or window, of two angles, or of an entry into the skin.
 
 `choose` returns the rows of one choice; `read_entries` and `read_targets` read many choices from a file, one a row.
 """

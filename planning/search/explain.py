@@ -75,7 +75,7 @@ class Explanation(Shown):
 
     @property
     def safe(self) -> bool:
-        """The verdict."""
+        """Whether the candidate breaks no constraint."""
         return bool(self.candidates.safe[0])
 
     @property
@@ -85,7 +85,7 @@ class Explanation(Shown):
 
     @property
     def target_depth_mm(self) -> float:
-        """How far the target lies from the surface of its own structure, mm."""
+        """Distance of the target from the surface of its own structure, mm."""
         return surface_distance(self.anatomy.structure(self.case.target_structure).mesh, self.case.target_ct)
 
     def clearances(self) -> dict[str, float]:
@@ -134,7 +134,7 @@ class Explanation(Shown):
         }
 
     def _declared(self) -> dict[str, Any]:
-        """What a case has only where it declares errors, bending, breathing, guidance or lines of sight."""
+        """Parts of the summary of a case that declares errors, bending, breathing, guidance or lines of sight."""
         row, breathing, insertion = self.candidates, self.candidates.breathing, self.insertion
         optional: dict[str, Any] = {}
         if self.case.errors is not None:
@@ -161,7 +161,7 @@ class Explanation(Shown):
         return optional
 
     def _at_target(self) -> dict[str, list[float]] | None:
-        """Joints, and both ends of the needle as the robot's controller prints them, when the tip is at the target."""
+        """Joints and both ends of the needle with the tip at the target, as the robot's controller prints them."""
         q = self.candidates.arm.q_insertion[0]
         if not np.isfinite(q).all():
             return None

@@ -73,14 +73,14 @@ def with_breathing_reach(
     """
     weights = moving_weights(case, breathing, anatomy)
     for s in breathing.positions[breathing.in_window].tolist():
-        rows, moved = np.flatnonzero(candidates.safe), breathing.moved_ct(s)
-        if not (moved.any() and len(rows)):
+        rows, shift_ct = np.flatnonzero(candidates.safe), breathing.moved_ct(s)
+        if not (shift_ct.any() and len(rows)):
             continue
         there = _arm_at(case, breathing, anatomy, weights, s, reach.T_base_ct)
-        paths = case_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
+        paths = case_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * shift_ct)
         path = replace(candidates.path, length=paths.path_length, skin_angle=paths.skin_angle)
         shifted = replace(candidates, path=path, arm=ArmColumns.unknown(len(candidates)))
-        at_phase = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there).verdict.of(rows)
+        at_phase = with_reach(replace(case, target_ct=case.target_ct + shift_ct), shifted, there).verdict.of(rows)
         candidates = replace(candidates, verdict=rejected_at(candidates.verdict, rows, at_phase, breathing, s))
     return candidates
 
@@ -95,11 +95,11 @@ def _arm_at(
     }
     R, by_skin = {"ct": np.eye(3), "base": T_base_ct[:3, :3]}, breathing.moved_ct(s, weights.skin)
 
-    def moved(mesh: TriangleMesh, by: Floats) -> TriangleMesh:
+    def displaced_mesh(mesh: TriangleMesh, by: Floats) -> TriangleMesh:
         return mesh.transformed(pose(np.eye(3), by)) if by.any() else mesh
 
-    skin = replace(anatomy.skin, mesh=moved(anatomy.skin.mesh, by_skin))
-    around = tuple(replace(one, mesh=moved(one.mesh, by_ct[one.name])) for one in anatomy.surroundings)
+    skin = replace(anatomy.skin, mesh=displaced_mesh(anatomy.skin.mesh, by_skin))
+    around = tuple(replace(one, mesh=displaced_mesh(one.mesh, by_ct[one.name])) for one in anatomy.surroundings)
     obstacles = [replace(one, center_mm=one.center_mm + R[one.frame] @ by_ct[one.name]) for one in case.obstacles]
     gantry = case.gantry
     if gantry is not None:
@@ -133,9 +133,9 @@ class BreathingBody:
         return np.asarray(np.max(at, axis=0))
 
     def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
-        """Skin paths (n, 3) at a position; entries in the moved skin's own coordinates."""
-        moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
-        return case_paths(self.case, self.anatomy.skin, outward_ct, moved)
+        """Skin paths (n, 3) at a position; entries in the coordinates of the displaced skin."""
+        shift_ct = (1 - self.weights.skin) * self.breathing.moved_ct(s)
+        return case_paths(self.case, self.anatomy.skin, outward_ct, shift_ct)
 
     @property
     def demanding(self) -> Ints:
@@ -177,9 +177,9 @@ class BreathingBody:
         checked, candidates, radius = self.anatomy.checked, self.candidates, self.case.needle.radius_mm
         clearance = candidates.clearance.by_structure[rows].copy()
         depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
-        moved = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
-        for shift in np.unique(shifts_ct[moved], axis=0):
-            columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moved)
+        moving = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
+        for shift in np.unique(shifts_ct[moving], axis=0):
+            columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moving)
             structures, length = tuple(checked[column] for column in columns), self.lengths[np.ix_(rows, columns)]
             target, outward, part = self.case.target_ct + shift, candidates.outward_ct[rows], self.engine.of(columns)
             at = measure_clearances(part, structures, target, outward, length=length, radius=radius)
@@ -317,7 +317,7 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
 
 
 def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
-    """Warnings about what a breathing case's verdicts mean; none where it declares no breathing."""
+    """Warnings on the meaning of a breathing case's verdicts; none where it declares no breathing."""
     breathing = case.breathing
     if breathing is None:
         return ()

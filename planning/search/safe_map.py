@@ -76,7 +76,7 @@ def safe_map(context: CaseContext) -> SafeMap:
 
 @dataclass(frozen=True, eq=False)
 class BestTarget(Shown):
-    """Which of many points has the widest window: the largest connected solid angle of open directions."""
+    """The point, of many, with the widest window: the largest connected solid angle of open directions."""
 
     points_ct: Floats
     """Shape (n, 3), mm, LPS; the context's own target is the first."""

@@ -112,7 +112,7 @@ def organ_candidates(
 
 
 class Blocking(NamedTuple):
-    """What blocks n directions of a grid."""
+    """The structures and the skin that block n directions of a grid."""
 
     structure: Ints32  # the first of ``anatomy.checked`` whose margin a direction breaks; -1 where none
     enters: Bools
@@ -125,7 +125,7 @@ class Blocking(NamedTuple):
 
 
 def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Blocking:
-    """What blocks the directions of a grid at a case's target: the first structure in the order of ``anatomy.checked``.
+    """First structure that blocks each direction of a grid at a case's target, in the order of ``anatomy.checked``.
 
     It accepts what `organ_candidates` accepts of a straight needle in a patient at rest, by maps of verdicts where the
     engine has them and by distances elsewhere (`tests/search/test_safe_map.py` compares both).

@@ -41,7 +41,7 @@ class Side(NamedTuple):
 
     @property
     def is_open(self) -> bool:
-        """Whether a needle can come from this side."""
+        """Whether a needle can reach the target from this side."""
         return self.open >= LEAST_OPEN
 
     def document(self) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
 
 
 def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) -> list[tuple[str, Bools]]:
-    """Why no needle comes from some directions, whatever organs are there, and from which."""
+    """Reasons that close directions whatever organs are there, and the directions that each closes."""
     length, needle = paths.path_length, case.needle
     unseen = np.isnan(length) | ~np.isnan(paths.unknown_depth)
     table = "lies on the table" if anatomy.couch is not None else "is near the end of the image"

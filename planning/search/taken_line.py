@@ -1,4 +1,4 @@
-"""The line that a needle really takes: its verdict, structure by structure, and what to do next.
+"""The line of an inserted needle, read from a scan: its verdict, structure by structure, and what to do next.
 
 A planned direction starts in the target; a needle that is in the patient starts in its tip, and may be bent. Each piece
 of its path is measured by the same engine, against the same structures and margins, from the piece's own end:
@@ -38,7 +38,7 @@ LEAST_MM = 0.5
 
 
 class Clear(NamedTuple):
-    """How near the needle comes to a structure, mm."""
+    """Clearance of the needle from one structure, mm."""
 
     name: str
     clearance_mm: float
@@ -50,17 +50,17 @@ class Clear(NamedTuple):
 
     @property
     def sure(self) -> bool:
-        """Whether it keeps its margin by as much as `SURE` demands."""
+        """Whether the clearance exceeds the margin by as much as `SURE` demands."""
         return bool(np.isnan(self.margin_mm)) or self.clearance_mm - SURE * self.sd_mm >= self.margin_mm
 
     def document(self) -> dict[str, Any]:
-        """Plain values."""
+        """Plain values for JSON."""
         return {name: value if isinstance(value, str) else or_null(value) for name, value in self._asdict().items()}
 
 
 @dataclass(frozen=True, eq=False)
 class LineCheck:
-    """The verdict of a line."""
+    """The verdict of an inserted needle's line."""
 
     verdict: str  # `SAFE`, `UNCERTAIN`, or a code of `Reason`
     structure: str  # which one decides; empty where none does
@@ -75,7 +75,7 @@ class LineCheck:
 
 
 def check_line(context: CaseContext, path_ct: Floats, covs_ct: Floats) -> LineCheck:
-    """Check a needle where it lies.
+    """Check an inserted needle along its line as read.
 
     Args:
         path_ct: Shape (m, 3), LPS mm, from the tip outward; beyond its last point it goes on straight.
@@ -147,7 +147,7 @@ def _skin(context: CaseContext, path_ct: Floats, outward: Floats, starts: Floats
 
 
 class Aim(NamedTuple):
-    """Something to do next, and what comes of it."""
+    """A next action on an inserted needle, and its expected result."""
 
     kind: str
     """``accept``, ``deeper`` (x mm; below 0 back), ``turn`` (to the skin and on by an angle) or ``withdraw``."""
@@ -161,16 +161,16 @@ class Aim(NamedTuple):
 
     @property
     def allowed(self) -> bool:
-        """Whether its line is safe."""
+        """Whether the line of this action is safe."""
         return self.verdict == SAFE
 
     def document(self) -> dict[str, Any]:
-        """Plain values."""
+        """Plain values for JSON."""
         return {name: value if isinstance(value, str) else or_null(value) for name, value in self._asdict().items()}
 
 
 def next_aims(context: CaseContext, path_ct: Floats, covs_ct: Floats, forward_ct: Floats, now: LineCheck) -> list[Aim]:
-    """Everything that can be done with a needle, the best first.
+    """Next actions on an inserted needle, the best first.
 
     Args:
         path_ct: As for `check_line`, which gave ``now``; ``covs_ct`` too.

@@ -150,7 +150,7 @@ def chance_text(chance: float) -> str:
 
 
 def way_cells(one: WayChance) -> tuple[str, str, str, str, str]:
-    """A way of guidance as a row of a table for a person, under `WAY_HEAD`."""
+    """Expected result of one kind of guidance, as a row of a table under `WAY_HEAD`."""
     if np.isnan(one.p_hit):
         return one.way, "-", "-", "-", one.lost_sight
     return one.way, f"{one.expected_error_mm:.2f}", chance_text(one.p_hit), chance_text(one.p_stop), one.lost_sight

@@ -1,4 +1,4 @@
-"""The needle's error under each way of guidance: one linear model of all devices, and the best linear estimate in it.
+"""The needle's error under each kind of guidance: one linear model of all devices, and the best linear estimate in it.
 
 Everything that errs is a source, normal with deviation 1: x. Everything of which nothing is known beforehand is flat:
 u, the patient's pose and the cameras' frame. Needle (shift and rotation at the tip), anatomy, target and each reading
@@ -126,7 +126,7 @@ def scan_roots(scan: ControlScanSection, errors: ErrorModel) -> tuple[Floats, Fl
 
 
 class Look(NamedTuple):
-    """One look of the devices on the way in."""
+    """One look of the devices during the insertion."""
 
     q: Floats  # shape (6,), rad: the arm as it is planned there
     out_mm: float  # tip to target
@@ -135,7 +135,7 @@ class Look(NamedTuple):
     """What is out of sight, by the names of `Reading`, and why; `CAMERAS` is all of theirs."""
 
     def hides(self, reading: Reading) -> bool:
-        """Whether a reading of this look is not there."""
+        """Whether a reading of this look is out of sight."""
         return reading.name in self.hidden or (reading.device == CAMERAS and CAMERAS in self.hidden)
 
 
@@ -162,7 +162,7 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GuidedModel:
-    """One insertion as guidance knows it; base axes."""
+    """Linear model of one insertion, of its devices' readings and their errors; base axes."""
 
     error: PoseError  # of the needle by its registration, the touches known or assumed
     markers: tuple[str, ...]
@@ -199,7 +199,7 @@ class GuidedModel:
         }
 
     def _bent(self, q: Floats, inserted: float) -> Rows:
-        """What the bend adds to it: tissue bends the needle the more, the deeper it is."""
+        """Deviation that the needle's bend adds, 6 rows: the deeper, the more."""
         bend = self.error.bend
         return {} if bend is None else {"bend": max(inserted, 0.0) ** 2 * bend.sides(self.error.model, q)}
 
@@ -223,14 +223,14 @@ class GuidedModel:
     @cached_property
     def readings(self) -> tuple[Reading, ...]:
         """All readings, less what the registration expects of them: the touches, then look by look."""
-        found = [Reading("touch", "touch", -1, self._touches())]
+        readings = [Reading("touch", "touch", -1, self._touches())]
         for number, look in enumerate(self.looks):
             needle = self.needle(look.q, f"arrival {number}")
-            found += self._seen_by_cameras(look, number, needle)
+            readings += self._seen_by_cameras(look, number, needle)
             tip = _times(np.eye(6)[:3], _sum(needle, self._bent(look.q, look.inserted)))
-            found += self._in_pictures(number, tip)
-            found += self._in_scan(look, number, tip)
-        return tuple(one for one in found if one.look < 0 or not self.looks[one.look].hides(one))
+            readings += self._in_pictures(number, tip)
+            readings += self._in_scan(look, number, tip)
+        return tuple(one for one in readings if one.look < 0 or not self.looks[one.look].hides(one))
 
     def _touches(self) -> Rows:
         noise, scale, count = self.error.fit.noise, self.error.fit.test.scale, len(self.points_base)
@@ -256,10 +256,10 @@ class GuidedModel:
             return []
         T, seen = flange_pose(self.error.model, look.q), dict[str, Rows]()
         tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
-        moved = {"breath": self.skin_weight * self.breath}
+        breathing = {"breath": self.skin_weight * self.breath}
         for row, (name, point) in enumerate(zip(self.markers, self.points_base, strict=True)):
             own = {source: part[3 * row : 3 * row + 3] for source, part in self._markers.items()}
-            seen[marker_name(name)] = _sum(own, moved, {"frame": self._at(point[None])})
+            seen[marker_name(name)] = _sum(own, breathing, {"frame": self._at(point[None])})
         for behind in self.stereo.balls_mm:
             ball = behind * outward[None]
             seen[ball_name(behind)] = _sum(_times(design(ball, np.zeros(3)), needle), {"frame": self._at(tip + ball)})
@@ -271,14 +271,14 @@ class GuidedModel:
     def _in_pictures(self, number: int, tip: Rows) -> list[Reading]:
         if self.ultrasound is None or self.across is None:
             return []
-        one, found = self.ultrasound, []
+        one, readings = self.ultrasound, []
         for name, rows, sd_mm in (("target", self._target_at(number), one.target_sd_mm), ("tip", tip, one.tip_sd_mm)):
             own = {
                 "calibration": one.calibration_sd_mm * np.eye(3),
                 f"pictured {name}": picture_root(sd_mm, self.across),
             }
-            found.append(Reading(name, name, number, _sum(rows, own)))
-        return found
+            readings.append(Reading(name, name, number, _sum(rows, own)))
+        return readings
 
     def _in_scan(self, look: Look, number: int, tip: Rows) -> list[Reading]:
         """Couch and patient are where they were at the CT, but for the motion: what it shows is in the CT's frame."""
@@ -288,11 +288,11 @@ class GuidedModel:
         there = T[:3, 3] + self.error.tip_mm * T[:3, 2]
         tip_root, target_root = (R @ root for root in scan_roots(self.scan, self.error.errors))
         own = {"pose": -self._at(there[None]), f"{SCANNED_TIP} {number}": tip_root}
-        found = [Reading("scan", SCANNED_TIP, number, _sum(tip, own))]
+        readings = [Reading("scan", SCANNED_TIP, number, _sum(tip, own))]
         if self.scan.target_seen:
             rows = _sum(self._target_at(number), {"pose": -np.eye(6)[:3], SCANNED_TARGET: target_root})
-            found.append(Reading("scan", SCANNED_TARGET, number, rows))
-        return found
+            readings.append(Reading("scan", SCANNED_TARGET, number, rows))
+        return readings
 
     def corrects(self, way: str) -> bool:
         """Whether a way reads anything but touches; those alone give the registration, and nothing to correct."""
@@ -384,7 +384,7 @@ class GuidedModel:
         """
         if not self.corrects(way):
             return 0.0
-        looked = [found for last in range(len(self.looks)) if (found := self.guided(way, last)) is not None]
+        looked = [estimate for last in range(len(self.looks)) if (estimate := self.guided(way, last)) is not None]
         aside = np.concatenate([one.aside @ self._stacked[0] for one in looked])
         mean = self._breath_of(aside)[:, 0]
         root = _root(aside @ aside.T - np.outer(mean, mean))
@@ -469,7 +469,7 @@ class Guided(NamedTuple):
 
 
 class WayChance(NamedTuple):
-    """What one way of guidance is expected to leave of one insertion."""
+    """Expected error and chances of one insertion under one kind of guidance."""
 
     way: str
     expected_error_mm: float
@@ -494,7 +494,7 @@ class GuidedError(PoseError):
 
     @property
     def known(self) -> Guided:
-        """What is there, of an error that is not blank."""
+        """The estimate of an error that is not blank."""
         assert self.guided is not None
         return self.guided
 
@@ -516,9 +516,9 @@ class GuidedError(PoseError):
         one = self.known
         known = one.breath[:, :1] if deviations is None else one.breath
         cov, shift = known @ known.T, known[:3] @ np.array([1.0, deviations or 0.0])[: known.shape[1]]
-        left = one._replace(cov=one.cov - cov, tip_cov=one.tip_cov - cov[:3, :3], breath=np.zeros((6, 2)))
-        return replace(self, guided=left), self.fit.R_base_ct.T @ shift
+        about_mean = one._replace(cov=one.cov - cov, tip_cov=one.tip_cov - cov[:3, :3], breath=np.zeros((6, 2)))
+        return replace(self, guided=about_mean), self.fit.R_base_ct.T @ shift
 
     def mean_squares(self, q: Floats) -> dict[str, float]:
-        """By source, those of devices and motion too."""
+        """Mean square of the tip by source, devices and motion included; mm^2."""
         return dict(self.known.parts)

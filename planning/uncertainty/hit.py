@@ -39,7 +39,7 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 @dataclass(frozen=True, eq=False)
 class HitModel:
-    """When a tip hits: within a radius of the target, or within its mesh."""
+    """Criterion of a hit: the tip within a radius of the target, or within its mesh."""
 
     radius_mm: float | None  # where a case gives one
     rays: TargetRays | None
@@ -151,7 +151,7 @@ def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True, eq=False)
 class TargetRays:
-    """A target's mesh as its point sees it."""
+    """Crossings of rays from the target with its mesh, or with a ball."""
 
     directions: Floats  # shape (n, 3), unit vectors, CT frame
     ray: Ints  # shape (c,), row of each crossing's direction
@@ -166,20 +166,20 @@ DIRECTIONS = 512
 
 
 def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
-    """Cast the directions once; the mesh is closed."""
+    """Crossings of `DIRECTIONS` rays from the target with its closed mesh."""
     directions = even_directions(DIRECTIONS)
-    found = crossings(mesh, target_ct, directions)
-    from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))  # 0 for a ray's last
+    crossing = crossings(mesh, target_ct, directions)
+    from_last = (crossing.first + crossing.count - 1)[crossing.ray] - np.arange(len(crossing.ray))  # 0 for a ray's last
     sign = np.where(from_last % 2 == 0, 1.0, -1.0)
-    area = _areas(mesh)[found.face]
-    facing = np.abs(np.einsum("ca,ca->c", area, directions[found.ray])) / (
+    area = _areas(mesh)[crossing.face]
+    facing = np.abs(np.einsum("ca,ca->c", area, directions[crossing.ray])) / (
         np.linalg.norm(area, axis=1) + LEAST_VARIANCE
     )
-    return TargetRays(directions, found.ray, found.depth, sign, sign / np.maximum(facing, GRAZING))
+    return TargetRays(directions, crossing.ray, crossing.depth, sign, sign / np.maximum(facing, GRAZING))
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
-    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
+    """Crossings with a ball about the target of rays from a tip with a known mean error.
 
     The offset (3,), mm, is the believed tip minus the target, in the covariance's axes.
     """

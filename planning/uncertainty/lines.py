@@ -216,13 +216,13 @@ class NeedleUncertainty:
 
     def reach(self, length: float, threshold: float) -> tuple[float, float]:
         """Distance within which a face may matter, mm, at the tip and at the axis' other end."""
-        tip, top, turn = self._widths(length)
+        tip, top, rotation = self._widths(length)
         start, end = threshold + self._size * (self.surface_mm + tip), threshold + self._size * (self.surface_mm + top)
-        return start, end + 0.5 * length * (self._size * turn) ** 2
+        return start, end + 0.5 * length * (self._size * rotation) ** 2
 
     @cached_property
     def _size(self) -> float:
-        """Standard deviations, and more than any line has."""
+        """Bound of the displacement on any line, in standard deviations."""
         return math.hypot(FARTHEST, WIDEST + 1.0) * (
             1.0 if self.freedom is None else float(error_sizes(self.freedom).max())
         )
@@ -231,11 +231,11 @@ class NeedleUncertainty:
     def _widths(self) -> Callable[[float], tuple[float, float, float]]:
         """Largest displacement of tip (mm), other end (mm) and direction (rad) per deviation, by length of the axis."""
         shift, lean = self.root[:3], self.root[3:]
-        tip, turn = float(np.linalg.norm(shift, 2)), float(np.linalg.norm(lean, 2))
+        tip, rotation = float(np.linalg.norm(shift, 2)), float(np.linalg.norm(lean, 2))
 
         @cache  # many structures are measured from axes of one length
         def of(length: float) -> tuple[float, float, float]:
-            return tip, float(np.linalg.norm(shift - length * skew(self.outward) @ lean, 2)), turn
+            return tip, float(np.linalg.norm(shift - length * skew(self.outward) @ lean, 2)), rotation
 
         return of
 
@@ -453,7 +453,7 @@ def _first_touch(scene, start, ahead, gap, hint):  # type: ignore[no-untyped-def
     return beta if gap < 0.0 else np.inf
 
 
-PREFERRED, SOONER, NO_MATTER = 0.1, 0.8, 3.8
+BETTER_BY, TOUCHED_SOONER, TOO_FAR = 0.1, 0.8, 3.8
 """Standard deviations by which another direction must be better than first order's; how much sooner than a plane
 something else is touched; and how far out it does not matter."""
 
@@ -471,18 +471,18 @@ def likeliest_slope(
     radii = np.empty(len(directions))
     first_touches(problem, uncertainty.root, directions, radii)
     best = int(np.argmin(radii))
-    if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + PREFERRED:
+    if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + BETTER_BY:
         best = 0
     flat = np.full(len(radii), np.inf)
     towards = directions @ directions[best]  # cosine: a plane across the best is hit at radius / cosine
     np.divide(radii[best], towards, out=flat, where=towards > 0.05)
-    alone = not bool(((radii < SOONER * flat) & (radii < NO_MATTER)).any())
+    alone = not bool(((radii < TOUCHED_SOONER * flat) & (radii < TOO_FAR)).any())
     return (slope, alone) if best == 0 else (-directions[best] * (slack / radii[best]), alone)
 
 
 @cache
 def _rays() -> Floats:
-    """Along each of five normals and between each two, with both signs: shape (50, 5)."""
+    """Unit vectors along each of five normals and between each two, with both signs: shape (50, 5)."""
     signs = (1.0, -1.0)
     ones = [sign * np.eye(5)[k] for k in range(5) for sign in signs]
     twos = [

@@ -60,8 +60,8 @@ class Bend(NamedTuple):
         Shape (..., 6, 2), base axes, for q of shape (..., 6), rad.
         """
         R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
-        x, y, turn = R[..., 0], R[..., 1], 1 / self.clamped_mm
-        columns = [np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)]
+        x, y, per_mm = R[..., 0], R[..., 1], 1 / self.clamped_mm
+        columns = [np.concatenate([x, per_mm * y], axis=-1), np.concatenate([y, -per_mm * x], axis=-1)]
         return np.asarray(self.tip_mm / np.sqrt(2.0) * np.stack(columns, axis=-1))
 
 
@@ -99,8 +99,8 @@ class PoseError:
 
     def covariance_ct(self, q: Floats) -> Floats:
         """Sigma6 in CT axes, shape (n, 6, 6)."""
-        turn = np.kron(np.eye(2), self.fit.R_base_ct)  # rotates shift and rotation alike
-        return np.asarray(turn.T @ self.covariance(q) @ turn)
+        rotation = np.kron(np.eye(2), self.fit.R_base_ct)  # rotates shift and rotation alike
+        return np.asarray(rotation.T @ self.covariance(q) @ rotation)
 
     def tip_covariance_ct(self, q: Floats) -> Floats:
         """`tip_covariance` in CT axes, shape (n, 3, 3)."""
@@ -134,20 +134,20 @@ class PoseError:
             "touch": touch,
             "repeatability": noise.cov_base - touch,
         }
-        found = dict[str, Floats]()
+        unscaled = dict[str, Floats]()
         for source, block in blocks.items():
             of_each = np.broadcast_to(block, noise.cov_base.shape)
             cov = np.einsum("anb,nbc,dnc->ad", marks, of_each, marks)
-            found[source] = np.broadcast_to(cov, (len(q), 6, 6))
+            unscaled[source] = np.broadcast_to(cov, (len(q), 6, 6))
         # of the arm's parameters, of its drift since the touches, and of one arrival at the target
         G, eta = not_cancelled(self.fit, J, self.target_base), self.fit.noise.eta_variances
-        found |= {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
+        unscaled |= {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
         Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
-        found["drift"] = _outer(Jq, np.full(6, arm.drift**2))
-        found["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
+        unscaled["drift"] = _outer(Jq, np.full(6, arm.drift**2))
+        unscaled["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
         if arm.jitter != 0.0:
-            found["jitter"] = _outer(Jq, np.full(6, arm.jitter**2))
-        parts = {source: self.fit.test.scale**2 * cov for source, cov in found.items()}
+            unscaled["jitter"] = _outer(Jq, np.full(6, arm.jitter**2))
+        parts = {source: self.fit.test.scale**2 * cov for source, cov in unscaled.items()}
         return parts if self.bend is None else {**parts, "bend": _bend_covariance(self.model, q, self.bend)}
 
     def mean_squares(self, q: Floats) -> dict[str, float]:
@@ -311,8 +311,8 @@ def choose_touches(error: PoseError, points_base: Floats, q_insertion: Floats) -
 
     Raises NoAnswerError: A marker that the arm cannot touch near the insertion's orientation.
     """
-    found = [touch_candidates(error.model, error.tip_mm, point, q_insertion) for point in points_base]
-    candidates = [one.alike if len(one.alike) else one.others for one in found]
+    reachable = [touch_candidates(error.model, error.tip_mm, point, q_insertion) for point in points_base]
+    candidates = [one.alike if len(one.alike) else one.others for one in reachable]
     for point, q in zip(points_base, candidates, strict=True):
         if not len(q):
             place = ", ".join(f"{value:.1f}" for value in point)

@@ -90,7 +90,7 @@ class CameraView(Shown):
 
     @property
     def sentence(self) -> str:
-        """What is seen, for a person."""
+        """Sentence on what the cameras see."""
         always = plural(int(self.seen[:, self.balls :].all(axis=0).sum()), "marker") + " seen throughout"
         if not self.clear:
             always += f"; a camera is nearer than {CAMERA_MM:g} mm to patient, surroundings or moving arm"
@@ -188,7 +188,7 @@ def candidate_pairs(T_ct_bed: Floats) -> tuple[Floats, Floats]:
 
 
 def hidden_by(surfaces: Surfaces, points_ct: Floats, cameras_ct: Floats, near_mm: float = 0.0) -> Names:
-    """By which surface any of some points is hidden from each camera; of several by the first in the list.
+    """Name of the surface that hides each point from each camera; of several by the first in the list.
 
     Args:
         points_ct: Shape (k, 3), mm.
@@ -204,8 +204,8 @@ def hidden_by(surfaces: Surfaces, points_ct: Floats, cameras_ct: Floats, near_mm
             rows = np.flatnonzero((names == "") & (cameras_ct != point).any(axis=1))
             apart = cameras_ct[rows] - point
             far = np.linalg.norm(apart, axis=1)
-            found = crossings(mesh, point, apart / far[:, None], float(far.max(initial=0.0)))
-            names[rows[found.ray[(found.depth >= near_mm) & (found.depth <= far[found.ray])]]] = name
+            crossing = crossings(mesh, point, apart / far[:, None], float(far.max(initial=0.0)))
+            names[rows[crossing.ray[(crossing.depth >= near_mm) & (crossing.depth <= far[crossing.ray])]]] = name
     return names
 
 
@@ -224,24 +224,24 @@ def _looks(
     """Arm and balls at each depth. The needle hides no ball: it runs through it. Nor does the holder one around it."""
     poses = inverse(plan.T_base_ct) @ link_poses(plan.model, plan.insertion.q)
     tips = poses[:, -1, :3, 3] + plan.needle_length_mm * poses[:, -1, :3, 2]
-    left, skin_mm = (tips - plan.target_ct) @ plan.outward_ct, float(np.linalg.norm(plan.entry_ct - plan.target_ct))
+    left_mm, skin_mm = (tips - plan.target_ct) @ plan.outward_ct, float(np.linalg.norm(plan.entry_ct - plan.target_ct))
     surfaces = [(body, joined([*filter(None, map(convex_hull, body.bare.hulls))])) for body in bodies[:-1]]
     cross = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    for wanted in np.linspace(left[0], left[-1], STEPS):
-        row, balls = int(np.argmin(np.abs(left - wanted))), []
+    for wanted in np.linspace(left_mm[0], left_mm[-1], STEPS):
+        row, balls = int(np.argmin(np.abs(left_mm - wanted))), []
         for mm in balls_mm:
             around = mm + BALL_MM > shaft_mm
             radius = BALL_MM + (holder_mm if around else 0.0)
-            inside = bool(left[row] + mm - radius < skin_mm)  # however open the skin is
+            inside = bool(left_mm[row] + mm - radius < skin_mm)  # however open the skin is
             balls.append((tips[row] + mm * plan.outward_ct + radius * cross, inside, around))
         arm = [(body.name, mesh.transformed(poses[row, body.frame] @ body.T_frame_body)) for body, mesh in surfaces]
-        yield _Look(float(left[row]), arm, tuple(balls))
+        yield _Look(float(left_mm[row]), arm, tuple(balls))
 
 
 def _hidden(looks: Sequence[_Look], static: Surfaces, markers_ct: Floats, cameras_ct: Floats) -> Names:
-    """By what each ball and marker is hidden at each depth from each camera (m, 3): shape (k, n, m), texts."""
+    """Names of what hides each ball and marker at each depth from each camera (m, 3): shape (k, n, m), texts."""
     still = [hidden_by(static, marker[None], cameras_ct, MARKER_MM) for marker in markers_ct]
-    found = []
+    names = []
     for look in looks:
         rows = []
         for points, inside, around in look.balls:
@@ -249,8 +249,8 @@ def _hidden(looks: Sequence[_Look], static: Surfaces, markers_ct: Floats, camera
             by_body = np.full(len(cameras_ct), PATIENT, object)
             rows.append(by_body if inside else hidden_by([*static, *arm], points, cameras_ct))
         moving = [hidden_by(look.arm, marker[None], cameras_ct, MARKER_MM) for marker in markers_ct]
-        found.append([*rows, *(np.where(one == "", other, one) for one, other in zip(still, moving, strict=True))])
-    return np.array(found, object)
+        names.append([*rows, *(np.where(one == "", other, one) for one, other in zip(still, moving, strict=True))])
+    return np.array(names, object)
 
 
 def _free_places(

@@ -66,7 +66,7 @@ BASES_APART_MM = 300.0
 
 
 class Ruled(StrEnum):
-    """By what a footprint is ruled out; of several the last that it came to."""
+    """Reasons that rule out a footprint; of several the last one reached."""
 
     NO_SKIN = "no_skin"
     TOO_DEEP = "too_deep"
@@ -100,7 +100,7 @@ STAGES = (tuple(Ruled)[6:], tuple(Ruled)[3:6], tuple(Ruled)[:3])
 
 @dataclass(frozen=True, eq=False)
 class ProbeView(Shown):
-    """Where the probe goes, or that it goes nowhere."""
+    """Place of the probe, or the reason why it has none."""
 
     T_ct_image: Floats | None
     """Shape (4, 4), mm: its origin in the middle of the face, x along the face toward the needle, y along the depth, z
@@ -114,7 +114,7 @@ class ProbeView(Shown):
 
     @property
     def sentence(self) -> str:
-        """What was found, for a person."""
+        """Sentence on the probe's place."""
         where = "an assumed place" if self.assumed else "its stated place"
         if self.T_ct_image is not None:
             return f"the probe sees needle and target at {self.depth_mm:.0f} mm of depth, its arm at {where}"
@@ -155,8 +155,8 @@ def probe_view(context: CaseContext, plan: Plan | Watched) -> ProbeView:
     rows, stated = feet.left, probe.T_base_ct_mount
     for T_base_ct in _mounts(context, plan) if stated is None else (stated,):
         arm = _arm(context, plan, probe, T_base_ct) if len(rows) else None
-        if arm is not None and (found := arm.place(feet, rows)) is not None:
-            row, q = found
+        if arm is not None and (placed := arm.place(feet, rows)) is not None:
+            row, q = placed
             T_ct_image, depth_mm = read_only(feet.T_ct_image[row]), float(feet.depth[row])
             return ProbeView(T_ct_image, read_only(q), T_base_ct, stated is None, depth_mm, feet.counts)
     feet.rule_out(rows[feet.ruled[rows] < 0], Ruled.PROBE_ARM)  # where no place was free for its base
@@ -165,7 +165,7 @@ def probe_view(context: CaseContext, plan: Plan | Watched) -> ProbeView:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Footprints, a row each."""
+    """Places of the probe's face on the skin, a row each."""
 
     skin: Skin
     target_ct: Floats  # shape (3,), mm
@@ -175,19 +175,19 @@ class Footprints:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How many are ruled out by what, those without first left out; ``free`` for the rest."""
+        """Number of footprints by the reason that rules them out; ``free`` for the rest."""
         names = [*_ORDER, FREE]
-        found = np.bincount(np.where(self.ruled < 0, len(_ORDER), self.ruled), minlength=len(names))
-        return MappingProxyType({name: int(count) for name, count in zip(names, found, strict=True) if count})
+        counts = np.bincount(np.where(self.ruled < 0, len(_ORDER), self.ruled), minlength=len(names))
+        return MappingProxyType({name: int(count) for name, count in zip(names, counts, strict=True) if count})
 
     @property
     def left(self) -> Ints:
-        """Rows that nothing rules out, the least depth first, of equal ones the farthest from the needle."""
+        """Rows that are not ruled out, the least depth first, of equal ones the farthest from the needle."""
         rows = np.flatnonzero(self.ruled < 0)
         return rows[np.argsort(self.depth[rows].round(6), kind="stable")]
 
     def rule_out(self, rows: Bools | Ints | int, why: Ruled) -> None:
-        """Note what rules some out, where they came farther than before."""
+        """Record a reason for some footprints, where they came farther than before."""
         self.ruled[rows] = np.maximum(self.ruled[rows], _ORDER.index(why))
 
 
@@ -219,18 +219,18 @@ Opaque = Mapping[Ruled, Sequence[TriangleMesh]]
 
 def opaque(anatomy: Anatomy, region: str) -> Opaque:
     """What no sound passes in a body, by names and roles of its structures; gas in the bowel only without a CT."""
-    found: dict[Ruled, list[TriangleMesh]] = {Ruled.UNKNOWN: [], Ruled.AIR: [], Ruled.BONE: []}
+    surfaces: dict[Ruled, list[TriangleMesh]] = {Ruled.UNKNOWN: [], Ruled.AIR: [], Ruled.BONE: []}
     airy = AIRY if anatomy.scan is None else AIRY[:-1]
     for one in anatomy.structures:
         line = default_role(one.name, region)
         group = "" if line is None else line.group
         if one.name == UNNAMED_DENSE or group in BONE:
-            found[Ruled.BONE].append(one.mesh)
+            surfaces[Ruled.BONE].append(one.mesh)
         elif one.name == UNNAMED_GAS or group in airy or not GAS.isdisjoint(plain_name(one.name).split("_")):
-            found[Ruled.AIR].append(one.mesh)
+            surfaces[Ruled.AIR].append(one.mesh)
         elif one.role is Role.UNKNOWN:
-            found[Ruled.UNKNOWN].append(one.mesh)
-    return found
+            surfaces[Ruled.UNKNOWN].append(one.mesh)
+    return surfaces
 
 
 def passing(feet: Footprints, surfaces: Opaque, scan: Scan | None, width_mm: float) -> None:

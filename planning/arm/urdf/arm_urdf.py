@@ -34,32 +34,32 @@ class BodyShape(NamedTuple):
 
 def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tuple[BodyShape, ...], ...]:
     """The collision shapes of each of the arm's seven bodies."""
-    found = []
+    bodies = []
     for number, members in enumerate(chain.bodies):
         shapes: list[BodyShape] = []
         for member in members:
-            link, here = member.link, f"{document.where}: link '{member.link.name}'"
+            link, where = member.link, f"{document.where}: link '{member.link.name}'"
             if link.drawn and not link.collisions:
                 allowed = "a <collision>; the mesh of its <visual> is enough"
-                refuse("it has a visual shape but no collision shape", here, allowed, "no_collision_shape")
+                refuse("it has a visual shape but no collision shape", where, allowed, "no_collision_shape")
             if link.collisions and link.name in chain.beyond:
                 allowed = "only the arm; parts on the flange belong to [tool] of the case"
-                refuse(f"it is fixed beyond the flange '{chain.flange}'", here, allowed, "shape_beyond_flange")
+                refuse(f"it is fixed beyond the flange '{chain.flange}'", where, allowed, "shape_beyond_flange")
             shapes += [
-                BodyShape(_mesh(shape, document, here, read), member.T_body_link @ shape.T_link_shape)
+                BodyShape(_mesh(shape, document, where, read), member.T_body_link @ shape.T_link_shape)
                 for shape in link.collisions
             ]
         if not shapes:
             names = ", ".join(member.link.name for member in members)
             what = f"nothing has a collision shape between the joints {number} and {number + 1} (links {names})"
             refuse(what, document.where, "at least one collision shape per link", "no_collision_shape")
-        found.append(tuple(shapes))
-    return tuple(found)
+        bodies.append(tuple(shapes))
+    return tuple(bodies)
 
 
-def _mesh(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> TriangleMesh:
+def _mesh(shape: UrdfShape, document: UrdfDocument, where: str, read: Read) -> TriangleMesh:
     if shape.kind == "mesh":
-        return _file(shape, document, here, read)
+        return _file(shape, document, where, read)
     if shape.kind == "box":
         return hull(np.array(list(product((-0.5, 0.5), repeat=3))) * shape.size)
     # of a sphere the prism is that about its cylinder
@@ -67,17 +67,17 @@ def _mesh(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
     return hull(ring_corners(radius / math.cos(math.pi / ROUND_SIDES), ROUND_SIDES, (-half, half)))
 
 
-def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> TriangleMesh:
+def _file(shape: UrdfShape, document: UrdfDocument, where: str, read: Read) -> TriangleMesh:
     if Path(shape.address).suffix.lower() not in MESH_SUFFIXES:
         allowed = f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts"
-        refuse(f"mesh '{shape.address}' has an unsupported format", here, allowed, "unknown_format")
+        refuse(f"mesh '{shape.address}' has an unsupported format", where, allowed, "unknown_format")
     path = document.where.parent / shape.address
     try:
         return parse_mesh(read(shape.address), path, unit=Unit.M, space=Space.LOCAL, up=Up.Z, stretch=shape.size)
     except InputError as error:
         what = f"mesh '{shape.address}': {error.what}"
         allowed = f'{error.allowed}; a URDF is in metres; scale="0.001 0.001 0.001" is for mm'
-        raise InputError(what, where=here, allowed=allowed, code=error.code) from error
+        raise InputError(what, where=where, allowed=allowed, code=error.code) from error
 
 
 def ring_corners(radius_mm: float, sides: int, heights_mm: tuple[float, float]) -> Floats:
@@ -91,8 +91,8 @@ def hull(points: Floats) -> TriangleMesh:
     """The convex hull of points (n, 3) that do not lie in one plane, mm."""
     import trimesh  # here: it costs a third of a second, and few need it
 
-    found = trimesh.convex.convex_hull(points)
-    return TriangleMesh(np.asarray(found.vertices), np.asarray(found.faces))
+    convex = trimesh.convex.convex_hull(points)
+    return TriangleMesh(np.asarray(convex.vertices), np.asarray(convex.faces))
 
 
 FLANGE = "tool0"
@@ -101,7 +101,7 @@ FLANGE = "tool0"
 
 @dataclass(frozen=True, eq=False)
 class ArmUrdf:
-    """A URDF that was found to be of an arm built as a UR."""
+    """The URDF of an arm that is built as a UR."""
 
     text: bytes
     document: UrdfDocument
@@ -112,7 +112,7 @@ class ArmUrdf:
 
     @property
     def where(self) -> Path:
-        """The file, to which its addresses are relative."""
+        """Path of the file, to which its mesh addresses are relative."""
         return self.document.where
 
     @property

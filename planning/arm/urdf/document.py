@@ -65,7 +65,7 @@ class UrdfLink:
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """One joint."""
+    """One joint of a URDF."""
 
     name: str
     kind: str  # one of ``JOINTS``
@@ -78,7 +78,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class UrdfDocument:
-    """A whole URDF."""
+    """All links and joints of a URDF."""
 
     name: str
     links: Mapping[str, UrdfLink]  # by name, in the file's order
@@ -132,9 +132,9 @@ def _link(element: Element, where: Path) -> UrdfLink:
     name = _plain(element, "a link", where)
     if name in TAKEN:
         refuse(f"a link called '{name}'", where, f"any name except {', '.join(TAKEN)} (the tool)", "reserved_name")
-    here = f"{where}: link '{name}'"
-    shapes = tuple(_shape(one, here) for one in element.findall("collision"))
-    return UrdfLink(name, shapes, element.find("visual") is not None, _weighs(element, here))
+    link_place = f"{where}: link '{name}'"
+    shapes = tuple(_shape(one, link_place) for one in element.findall("collision"))
+    return UrdfLink(name, shapes, element.find("visual") is not None, _weighs(element, link_place))
 
 
 def _plain(element: Element, what: str, where: Path) -> str:
@@ -144,29 +144,29 @@ def _plain(element: Element, what: str, where: Path) -> str:
     return name
 
 
-def _shape(element: Element, here: str) -> UrdfShape:
-    geometry = _only(element, "geometry", here)
+def _shape(element: Element, where: str) -> UrdfShape:
+    geometry = _only(element, "geometry", where)
     kinds = [one.tag for one in geometry]
     if len(kinds) != 1 or kinds[0] not in SHAPES:
-        found = ", ".join(kinds) or "nothing"
-        refuse(f"a collision of {found}", here, f"one of {', '.join(SHAPES)}", "unknown_shape")
+        present = ", ".join(kinds) or "nothing"
+        refuse(f"a collision of {present}", where, f"one of {', '.join(SHAPES)}", "unknown_shape")
     kind, shape = kinds[0], geometry[0]
     for key in SHAPES[kind]:
         if not shape.get(key, "").strip():
-            refuse(f"<{kind}> without {key}", here, ", ".join(SHAPES[kind]), "missing_key")
-    T = _origin(element, here)
+            refuse(f"<{kind}> without {key}", where, ", ".join(SHAPES[kind]), "missing_key")
+    T = _origin(element, where)
     if kind == "mesh":
-        scale = _numbers(shape, "scale", 3, here) if "scale" in shape.attrib else np.ones(3)
+        scale = _numbers(shape, "scale", 3, where) if "scale" in shape.attrib else np.ones(3)
         if not (scale > 0.0).all():
             what = f'scale="{shape.get("scale")}" mirrors or flattens the mesh'
-            refuse(what, here, "three factors above 0", "mirrored")
+            refuse(what, where, "three factors above 0", "mirrored")
         return UrdfShape(kind, T, shape.get("filename", ""), scale)
     counts = {"size": 3}
-    size = MM_PER_M * np.concatenate([_numbers(shape, key, counts.get(key, 1), here) for key in SHAPES[kind]])
+    size = MM_PER_M * np.concatenate([_numbers(shape, key, counts.get(key, 1), where) for key in SHAPES[kind]])
     if not ((size > 0.0) & (size <= MOST_SIZE_MM)).all():
         refuse(
             f"<{kind}> of {', '.join(f'{value:g}' for value in size)} mm",
-            here,
+            where,
             f"above 0, at most {MOST_SIZE_MM:g} mm",
             "out_of_range",
         )
@@ -175,55 +175,57 @@ def _shape(element: Element, here: str) -> UrdfShape:
 
 def _joint(element: Element, where: Path) -> UrdfJoint:
     name = _plain(element, "a joint", where)
-    here, kind = f"{where}: joint '{name}'", element.get("type", "")
+    joint_place, kind = f"{where}: joint '{name}'", element.get("type", "")
     if kind not in JOINTS:
-        refuse(f"type '{kind}'", here, ", ".join(JOINTS), "unknown_joint_type")
+        refuse(f"type '{kind}'", joint_place, ", ".join(JOINTS), "unknown_joint_type")
     if element.find("mimic") is not None:
-        refuse("it mimics another joint", here, "independent joints", "mimic_joint")
-    parent, child = (_only(element, end, here).get("link", "") for end in ("parent", "child"))
+        refuse("it mimics another joint", joint_place, "independent joints", "mimic_joint")
+    parent, child = (_only(element, end, joint_place).get("link", "") for end in ("parent", "child"))
     stated_axis, limit = element.find("axis"), element.find("limit")
-    axis = np.array([1.0, 0.0, 0.0]) if stated_axis is None else _numbers(stated_axis, "xyz", 3, here)
+    axis = np.array([1.0, 0.0, 0.0]) if stated_axis is None else _numbers(stated_axis, "xyz", 3, joint_place)
     length = float(np.linalg.norm(axis))
     if length == 0.0:
-        refuse("its axis is zero", here, "a direction", "zero_direction")
+        refuse("its axis is zero", joint_place, "a direction", "zero_direction")
     stated = (
-        {} if limit is None else {key: float(_numbers(limit, key, 1, here)[0]) for key in LIMITS if key in limit.attrib}
+        {}
+        if limit is None
+        else {key: float(_numbers(limit, key, 1, joint_place)[0]) for key in LIMITS if key in limit.attrib}
     )
-    return UrdfJoint(name, kind, parent, child, _origin(element, here), axis / length, stated)
+    return UrdfJoint(name, kind, parent, child, _origin(element, joint_place), axis / length, stated)
 
 
-def _origin(element: Element, here: str) -> Floats:
+def _origin(element: Element, where: str) -> Floats:
     """The ``origin`` of a joint or a shape as (4, 4), mm: rpy about the fixed axes x, y, z, in this order."""
     origins = element.findall("origin")
     if not origins:
         return np.eye(4)
     if len(origins) > 1 or not set(origins[0].attrib) <= {"xyz", "rpy"}:
-        refuse("an <origin> with more than xyz and rpy, or two of them", here, "one <origin>", "duplicate_element")
+        refuse("an <origin> with more than xyz and rpy, or two of them", where, "one <origin>", "duplicate_element")
     xyz, rpy = (
-        _numbers(origins[0], key, 3, here) if key in origins[0].attrib else np.zeros(3) for key in ("xyz", "rpy")
+        _numbers(origins[0], key, 3, where) if key in origins[0].attrib else np.zeros(3) for key in ("xyz", "rpy")
     )
     return pose(about_fixed_axes(rpy), MM_PER_M * xyz)
 
 
-def _weighs(element: Element, here: str) -> bool:
+def _weighs(element: Element, where: str) -> bool:
     inertial = element.find("inertial")
     if inertial is None:
         return False
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
     if mass is None or tensor is None:
         return False
-    diagonal = [_numbers(tensor, key, 1, here)[0] for key in ("ixx", "iyy", "izz") if key in tensor.attrib]
-    return len(diagonal) == 3 and min(*diagonal, _numbers(mass, "value", 1, here)[0]) > 0.0
+    diagonal = [_numbers(tensor, key, 1, where)[0] for key in ("ixx", "iyy", "izz") if key in tensor.attrib]
+    return len(diagonal) == 3 and min(*diagonal, _numbers(mass, "value", 1, where)[0]) > 0.0
 
 
-def _only(element: Element, tag: str, here: str) -> Element:
-    found = element.findall(tag)
-    if len(found) != 1:
-        refuse(f"{len(found)} <{tag}>", here, "one", "wrong_count")
-    return found[0]
+def _only(element: Element, tag: str, where: str) -> Element:
+    elements = element.findall(tag)
+    if len(elements) != 1:
+        refuse(f"{len(elements)} <{tag}>", where, "one", "wrong_count")
+    return elements[0]
 
 
-def _numbers(element: Element, key: str, count: int, here: str) -> Floats:
+def _numbers(element: Element, key: str, count: int, where: str) -> Floats:
     """The finite numbers of an attribute, shape (count,); refused where there are more or fewer."""
     text = element.get(key, "")
     try:
@@ -232,5 +234,5 @@ def _numbers(element: Element, key: str, count: int, here: str) -> Floats:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
         allowed = "a finite number" if count == 1 else f"{count} finite numbers"
-        refuse(f'<{element.tag} {key}="{text}">', here, allowed, "not_a_number")
+        refuse(f'<{element.tag} {key}="{text}">', where, allowed, "not_a_number")
     return np.array(values)

@@ -142,8 +142,8 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
 
 
 def _other(chain: ArmChain, joint: int, what: str, document: UrdfDocument) -> InputError:
-    said = f"axis {joint + 1} ('{chain.joints[joint].name}') {what}"
-    return InputError(said, where=document.where, allowed=AS_UR, code="arm_not_as_ur")
+    sentence = f"axis {joint + 1} ('{chain.joints[joint].name}') {what}"
+    return InputError(sentence, where=document.where, allowed=AS_UR, code="arm_not_as_ur")
 
 
 MOST_RAD = 4.0 * math.pi
@@ -180,11 +180,11 @@ def urdf_limits(joints: tuple[UrdfJoint, ...], stated: StatedLimits, where: Path
     """
     angles, speeds, torques = np.empty((6, 2)), np.empty(6), np.empty(6)
     for row, joint in enumerate(joints):
-        here = f"{where}: joint '{joint.name}'"
+        joint_place = f"{where}: joint '{joint.name}'"
         lacking = joint.kind == "continuous" or not {"lower", "upper"} <= set(joint.limits)
-        angles[row] = (-MOST_RAD, MOST_RAD) if stated.angles is not None and lacking else _angles(joint, here)
-        speeds[row] = _above_zero(joint, "velocity", here, "rad/s", MOST_RAD_S)
-        torques[row] = _above_zero(joint, "effort", here, "N m", math.inf)
+        angles[row] = (-MOST_RAD, MOST_RAD) if stated.angles is not None and lacking else _angles(joint, joint_place)
+        speeds[row] = _above_zero(joint, "velocity", joint_place, "rad/s", MOST_RAD_S)
+        torques[row] = _above_zero(joint, "effort", joint_place, "N m", math.inf)
     return JointLimits(angles, speeds, torques)
 
 
@@ -215,25 +215,25 @@ def narrowed(known: JointLimits, stated: StatedLimits, where: str) -> JointLimit
     return JointLimits(angles, speeds, known.torques)
 
 
-def _angles(joint: UrdfJoint, here: str) -> tuple[float, float]:
+def _angles(joint: UrdfJoint, where: str) -> tuple[float, float]:
     if joint.kind == "continuous":
-        refuse("it is continuous, without limits", here, "revolute, or [robot.limits]", "missing_limits")
+        refuse("it is continuous, without limits", where, "revolute, or [robot.limits]", "missing_limits")
     if not {"lower", "upper"} <= set(joint.limits):
-        refuse("<limit> lacks lower or upper", here, "lower and upper, in rad; or [robot.limits]", "missing_limits")
+        refuse("<limit> lacks lower or upper", where, "lower and upper, in rad; or [robot.limits]", "missing_limits")
     low, high = joint.limits["lower"], joint.limits["upper"]
     if not low < high:
-        refuse(f"limits from {low:g} to {high:g}", here, "lower less than upper, in rad", "out_of_range")
+        refuse(f"limits from {low:g} to {high:g}", where, "lower less than upper, in rad", "out_of_range")
     if max(-low, high) > MOST_RAD:
         what = f"limits from {low:g} to {high:g} rad, which look like degrees"
-        refuse(what, here, f"rad, at most {MOST_RAD:.2f} either way", "wrong_unit")
+        refuse(what, where, f"rad, at most {MOST_RAD:.2f} either way", "wrong_unit")
     return low, high
 
 
-def _above_zero(joint: UrdfJoint, key: str, here: str, unit: str, most: float) -> float:
+def _above_zero(joint: UrdfJoint, key: str, where: str, unit: str, most: float) -> float:
     value = joint.limits.get(key, 0.0)
     if not 0.0 < value <= most:
         allowed = f"above 0{'' if math.isinf(most) else f', at most {most:.2f}'} {unit}"
-        refuse(f'<limit {key}="{value:g}">', here, allowed, "out_of_range")
+        refuse(f'<limit {key}="{value:g}">', where, allowed, "out_of_range")
     return value
 
 
@@ -290,8 +290,8 @@ def arm_chain(document: UrdfDocument, flange: str) -> ArmChain:
             what = f"joint '{joint.name}' ({joint.kind}) moves a part outside the chain to the flange '{flange}'"
             refuse(what, where, "six revolute joints; all others fixed", "moving_branch")
     if len(turning) != JOINT_COUNT or any(joint.kind not in TURNING for joint in turning):
-        found = ", ".join(f"{joint.name} ({joint.kind})" for joint in turning) or "none"
-        refuse(f"the moving joints are {found}", where, "six revolute joints in a row", "not_six_joints")
+        names = ", ".join(f"{joint.name} ({joint.kind})" for joint in turning) or "none"
+        refuse(f"the moving joints are {names}", where, "six revolute joints in a row", "not_six_joints")
     bodies, places = _bodies(document, above, turning)
     to_joint = [places[joint.parent] @ joint.T_parent_child for joint in turning]
     beyond = frozenset(name for name in document.links if name != flange and flange in _ancestors(above, name))
@@ -299,7 +299,7 @@ def arm_chain(document: UrdfDocument, flange: str) -> ArmChain:
 
 
 def _parents(document: UrdfDocument) -> dict[str, UrdfJoint]:
-    """The joint that each link hangs on; only the root hangs on none."""
+    """The parent joint of each link; the root has none."""
     above: dict[str, UrdfJoint] = {}
     for joint in document.joints:
         if joint.child in above:
@@ -315,11 +315,11 @@ def _parents(document: UrdfDocument) -> dict[str, UrdfJoint]:
 
 def _ancestors(above: Mapping[str, UrdfJoint], name: str) -> list[str]:
     """The links above one, the nearest first; a ring ends where it closes."""
-    found: list[str] = []
-    while name in above and above[name].parent not in found:
+    ancestors: list[str] = []
+    while name in above and above[name].parent not in ancestors:
         name = above[name].parent
-        found.append(name)
-    return found
+        ancestors.append(name)
+    return ancestors
 
 
 def _bodies(
