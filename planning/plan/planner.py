@@ -62,7 +62,7 @@ def make_plan(
         except NoAnswerError as error:
             last = str(error)
             why = {"reason": Reason.APPROACH_NOT_FOUND.value, "detail": last}
-            candidates = replace(candidates, verdict=candidates.verdict.put(np.array([row]), **why))
+            candidates = replace(candidates, verdict=candidates.verdict.with_rows(np.array([row]), **why))
             candidates = ranked(context.case, candidates)
             continue
         return Planned(plan, candidates, int(row))

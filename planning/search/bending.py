@@ -54,7 +54,7 @@ def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance:
         f"it may bend by {bend:.2f} mm; the margin is {one.margin_mm:g} mm"
         for bend, one in zip(deflection[rows], broken, strict=True)
     ]
-    return verdict.put(
+    return verdict.with_rows(
         rows,
         reason=Reason.NEEDLE_BENDS.value,
         structure=np.array([one.name for one in broken], dtype=object),

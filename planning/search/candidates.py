@@ -72,7 +72,7 @@ class Verdict(Columns):
         """The verdicts of some rows."""
         return Verdict(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
-    def put(self, rows: Ints, **columns: Texts | Floats | str) -> Verdict:
+    def with_rows(self, rows: Ints, **columns: Texts | Floats | str) -> Verdict:
         """The verdicts with some columns of rows (m,) replaced, each by one value or by an array, shape (m,)."""
         arrays = {name: getattr(self, name).copy() for name in columns}
         for name, values in columns.items():
@@ -180,7 +180,7 @@ class Chances(Columns):
         blank = {name: np.full(shapes.get(name, (count,)), np.nan) for name in names}
         return cls(structures, refined=np.zeros(count, bool), **blank)
 
-    def put(self, rows: Ints, known: Chances) -> Chances:
+    def with_rows(self, rows: Ints, known: Chances) -> Chances:
         """These chances with those of some candidates replaced."""
         values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}
         for name, value in values.items():

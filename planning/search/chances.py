@@ -242,7 +242,7 @@ def with_chances(
     computed = [model.chances(outward[part], q[part], of) for part, of in zip(parts, measured, strict=True)]
     chances = Chances.unknown(names, len(candidates))
     for part, of_part in zip(parts, computed, strict=True):
-        chances = chances.put(part, of_part)
+        chances = chances.with_rows(part, of_part)
     return limited(case, refined_near_limits(replace(candidates, chances=chances), model))
 
 
@@ -254,7 +254,7 @@ def limited(case: Case, candidates: Candidates) -> Candidates:
     if least is not None:
         rows = np.flatnonzero(verdict.safe & ~(chances.hit >= least))  # true for NaN
         reason, target = Reason.HIT_UNLIKELY.value, case.target_structure
-        verdict = verdict.put(rows, reason=reason, structure=target, amount=chances.hit[rows])
+        verdict = verdict.with_rows(rows, reason=reason, structure=target, amount=chances.hit[rows])
     limits = np.array([touch_limit(case, name) for name in chances.structures])
     touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)
     with np.errstate(invalid="ignore"):  # without a limit both may be infinite
@@ -262,7 +262,7 @@ def limited(case: Case, candidates: Candidates) -> Candidates:
     rows = np.flatnonzero(verdict.safe & (beyond > 0).any(axis=1))
     worst = beyond[rows].argmax(axis=1) if len(rows) else rows
     names, amount = np.array(chances.structures, dtype=object)[worst], chances.touch[rows, worst]
-    verdict = verdict.put(rows, reason=Reason.TOUCH_LIKELY.value, structure=names, amount=amount)
+    verdict = verdict.with_rows(rows, reason=Reason.TOUCH_LIKELY.value, structure=names, amount=amount)
     return replace(candidates, verdict=verdict)
 
 
@@ -301,7 +301,7 @@ def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Cand
     names = [field.name for field in fields(chances) if field.name != "structures"]
     first = Chances(chances.structures, **{name: getattr(chances, name)[rows] for name in names})
     better = refined_chances(model, candidates.outward_ct[rows], candidates.arm.q_insertion[rows], first)
-    return replace(candidates, chances=chances.put(rows, better))
+    return replace(candidates, chances=chances.with_rows(rows, better))
 
 
 def with_best_chances(candidates: Candidates, model: ChanceModel) -> Candidates:

@@ -43,15 +43,15 @@ def first_broken(
 ) -> Verdict:
     """Verdict of n candidates for skin and organs: each one's reason is the first constraint that it breaks.
 
-    The order is that of the ``give`` calls. Unscanned regions come first: nothing behind them is known. Structures come
-    last: some matter only to a tip that waits at its standoff, so only on paths that satisfy the others.
+    The order is that of the ``reject`` calls. Unscanned regions come first: nothing behind them is known. Structures
+    come last: some matter only to a tip that waits at its standoff, so only on paths that satisfy the others.
     """
     count = len(paths.path_length)
     reasons, names_of, details = (np.full(count, "", dtype=object) for _ in range(3))
     depths, amounts = np.full(count, np.nan), np.full(count, np.nan)
     unset = np.ones(count, bool)
 
-    def give(reason: Reason, where: Bools, names: Column, depth: Column, amount: Column = np.nan) -> None:
+    def reject(reason: Reason, where: Bools, names: Column, depth: Column, amount: Column = np.nan) -> None:
         rows = np.flatnonzero(where & unset)  # a row that has a reason already is not changed
         unset[rows] = False
         reasons[rows] = reason.value
@@ -61,19 +61,19 @@ def first_broken(
             column[rows] = value[rows] if isinstance(value, np.ndarray) else value
 
     length, worst = paths.path_length, worst_violation(clearances, structures)
-    give(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), SKIN, paths.unknown_depth)
-    give(Reason.NO_SKIN_ENTRY, np.isnan(length), SKIN, np.nan)
-    give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), SKIN, paths.reentry_depth)
-    give(Reason.TOO_LONG, length > needle.longest_path_mm, SKIN, length, length)
-    give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, SKIN, length, np.degrees(paths.skin_angle))
+    reject(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), SKIN, paths.unknown_depth)
+    reject(Reason.NO_SKIN_ENTRY, np.isnan(length), SKIN, np.nan)
+    reject(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), SKIN, paths.reentry_depth)
+    reject(Reason.TOO_LONG, length > needle.longest_path_mm, SKIN, length, length)
+    reject(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, SKIN, length, np.degrees(paths.skin_angle))
     names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]
     rows = np.arange(count)
     if structures:
         broken = np.asarray(clearances.violated.any(axis=1))
         depth, amount = clearances.depth[rows, worst], clearances.clearance[rows, worst]
-        give(Reason.UNKNOWN_REGION, broken & unknown, names, depth, amount)
-        give(Reason.TOO_CLOSE, broken, names, depth, amount)
+        reject(Reason.UNKNOWN_REGION, broken & unknown, names, depth, amount)
+        reject(Reason.TOO_CLOSE, broken, names, depth, amount)
     return Verdict(reasons, names_of, depths, amounts, details)
 
 

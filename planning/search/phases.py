@@ -215,7 +215,7 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
     reasons = zip(at_phase.reason, at_phase.detail, strict=True)
     when = f"at {breathing.phase_text(s)}"
     details = [f"{when}: {REASON_TEXT[Reason(reason)]}{more and f', {more}'}" for reason, more in reasons]
-    return verdict.put(
+    return verdict.with_rows(
         rows[new],
         reason=Reason.UNSAFE_WHEN_BREATHING.value,
         structure=at_phase.structure,
