@@ -23,8 +23,9 @@ from benchmarks.shared import options
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.twin.guidance.ultrasound.acquisition import ProbeDevices, acquire, choose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, ShotByShot, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import DeclaredArms, Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, TwoArms, find_candidates
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case

@@ -1,4 +1,4 @@
-"""Gauss-Newton, damped where a step fails: least squares for whichever value is estimated.
+"""Least squares for whichever value is estimated: whitening, Gauss-Newton damped where a step fails, and an F-test.
 
 At an estimate x the residuals r, each in its standard deviation, have the slopes J. A step s solves
 
@@ -7,6 +7,13 @@ At an estimate x the residuals r, each in its standard deviation, have the slope
 along the axes (eigenvectors) of J^T J that are more than rounding; l is its largest eigenvalue, and the damping d is 0
 until a step raises the cost |r|^2 (Levenberg-Marquardt). The estimate may be of any kind that can be moved, and the
 weights may follow it. Where it is a vector and the weights are fixed, `scipy.optimize.least_squares` serves.
+
+Whitening. Residuals come in rows, each with a noise Omega_i of its own, whitened alone. Errors that all rows share (N
+per standard deviation of each) couple them: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1/2 N
+
+    C^-1/2 = (I + S S^T)^-1/2 Omega^-1/2,   (I + S S^T)^-1/2 = I - S V diag(1 / (s (s + 1))) V^T S^T,   s^2 = 1 + d^2,
+
+where S^T S = V diag(d^2) V^T. The same estimate comes from taking the shared errors as unknowns with a prior.
 """
 
 from __future__ import annotations
@@ -30,6 +37,45 @@ MOST_DAMPINGS = 30
 """Dampings of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
 UNSEEN = 1e-6
 """Relative length of a column outside of the model's own below which the data cannot show it."""
+LEAST_WEIGHT = 1e-12
+"""A residual that is set aside has this weight: its standard deviation is a million times as large."""
+
+
+def whitener(sigma: Floats, weights: Floats) -> Floats:
+    """W (n, k, k) with W^T W the inverse of sigma (n, k, k), each times its weight (n, k); 0 sets a residual aside."""
+    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))  # a weight divides the variance
+    scaled = sigma * spread[:, :, None] * spread[:, None, :]
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)))
+
+
+class Whitening(NamedTuple):
+    """C^-1/2 of residuals in n rows of k, which share m errors."""
+
+    own: Floats  # whitener of each row alone, shape (n, k, k)
+    shared: Floats | None  # S, shape (n k, m); None where nothing is shared
+    inner: Floats  # V diag(1 / (s (s + 1))) V^T, shape (m, m)
+
+    @classmethod
+    def of(cls, sigma: Floats, slopes: Floats | None, weights: Floats) -> Whitening:
+        """C^-1/2 of rows with noise of their own, sigma (n, k, k), and shared errors, N (n, k, m); weights (n, k)."""
+        own = whitener(sigma, weights)
+        if slopes is None:
+            return cls(own, None, np.zeros((0, 0)))
+        shared = (own @ slopes).reshape(-1, slopes.shape[2])
+        squared, V = np.linalg.eigh(shared.T @ shared)
+        s = np.sqrt(1.0 + np.maximum(squared, 0.0))  # s^2 = 1 + d^2
+        return cls(own, shared, (V / (s * (s + 1.0))) @ V.T)
+
+    def residuals(self, r: Floats) -> Floats:
+        """Whitened residuals (n, k), shape (n k,)."""
+        return self._coupled((self.own @ r[:, :, None]).reshape(-1))
+
+    def slopes(self, J: Floats) -> Floats:
+        """Whitened slopes (n, k, p), shape (n k, p)."""
+        return self._coupled((self.own @ J).reshape(-1, J.shape[2]))
+
+    def _coupled(self, x: Floats) -> Floats:
+        return x if self.shared is None else np.asarray(x - self.shared @ (self.inner @ (self.shared.T @ x)))
 
 
 class System(NamedTuple, Generic[X]):

@@ -11,10 +11,11 @@ from selfcal_world import as_estimate, joined
 
 from benchmarks.selfcal_rooms import Kind, outcome, recorded, room_of
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.geometry.gauss_newton import Whitening
 from puncture_twin.planning.geometry.rigid import log_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq import equation
+from puncture_twin.twin.guidance.ultrasound.axp_ybq import arm_errors, equation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import PLAY_SIGN, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import Whitening, plain_fit, weighed, with_spreads
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import plain_fit, weighed, with_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import aim, drawing
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
@@ -62,7 +63,7 @@ def test_the_flanges_slopes_are_the_finite_differences(room):
             ends = []
             for sign in (1, -1):
                 flanges = [recording.A, recording.B]
-                flanges[which] = equation.corrected(flanges[which], sign * step)
+                flanges[which] = arm_errors.corrected(flanges[which], sign * step)
                 ends.append(both(*flanges))
             np.testing.assert_allclose(slopes[which][:, :, column], (ends[0] - ends[1]) / 2e-4, atol=1e-5)
 
@@ -70,12 +71,12 @@ def test_the_flanges_slopes_are_the_finite_differences(room):
 def test_the_declared_errors_move_the_true_arms_flanges(room):
     """An arm of the twin, drawn from the declaration, has its flange where its errors, to first order, carry it."""
     case, _, truth, recording = room
-    errors = equation.arm_errors(case.declared_arms, recording)
+    errors = arm_errors.arm_errors(case.declared_arms, recording)
     arm, sigma = truth.probe_arm, case.declared_arms.probe.deviations()
     true = arm.true
     offsets = (true.a - arm.nominal.a, (true.d - arm.nominal.d)[[0, 2, 3, 4, 5]], true.alpha - arm.nominal.alpha)
     eta = np.concatenate([*offsets, true.zeros]) / sigma
-    moved, true = equation.corrected(recording.A, errors.probe.slopes @ eta), arm.flange_pose(recording.q_probe)
+    moved, true = arm_errors.corrected(recording.A, errors.probe.slopes @ eta), arm.flange_pose(recording.q_probe)
     np.testing.assert_allclose(moved[:, :3, 3], true[:, :3, 3], atol=2e-3)
     turned = log_rotation(moved[:, :3, :3].transpose(0, 2, 1) @ true[:, :3, :3])
     assert np.abs(turned).max() < 2e-6
@@ -91,7 +92,7 @@ def test_the_declared_play_is_where_the_true_arm_stops(room):
     declared = case.declared_arms._replace(probe=case.declared_arms.probe._replace(errors=errors))
     arm = truth.probe_arm._replace(backlash=2 * half, repeatability=0.0)
     told = replace(recording, turn_probe=turn, turn_needle=np.zeros(turn.shape))
-    moved = equation.without_play(told, equation.arm_errors(declared, told))
+    moved = arm_errors.without_play(told, arm_errors.arm_errors(declared, told))
     for q, way, nominal, with_play in zip(recording.q_probe, turn, recording.A, moved.A, strict=True):
         rest = arm.settle(q, q - 0.1 * way, rng)
         np.testing.assert_allclose(with_play, flange_pose(arm.nominal, rest), atol=2e-5)
@@ -108,8 +109,8 @@ def test_play_of_unknown_sign_is_noise(room):
         for stated in ({"repeatability_deg": 0.0, "backlash_deg": 0.02}, {"repeatability_deg": 0.01})
     )
     for one in (recording, replace(recording, **{key: np.zeros((30, 6)) for key in ("turn_probe", "turn_needle")})):
-        found = equation.arm_errors(play, one)
-        np.testing.assert_allclose(found.probe.arrival, equation.arm_errors(noise, one).probe.arrival, rtol=1e-12)
+        found = arm_errors.arm_errors(play, one)
+        np.testing.assert_allclose(found.probe.arrival, arm_errors.arm_errors(noise, one).probe.arrival, rtol=1e-12)
         assert not found.probe.play.any()
         assert not found.probe.slopes[:, :, 23:].any()
     assert PLAY_SIGN in calibrate(recording, noise=NOISE, arms=play).cannot_show
@@ -122,10 +123,10 @@ def test_whitening_is_the_inverse_root_of_the_whole_covariance(room):
     """
     case, _, _, recording = room
     problem = equation.Problem(
-        recording, NOISE, ALL, np.radians(0.5), equation.arm_errors(case.declared_arms, recording)
+        recording, NOISE, ALL, np.radians(0.5), arm_errors.arm_errors(case.declared_arms, recording)
     )
     fit = plain_fit(problem, drawing(case))
-    r, J, sigma, shared = equation.linear_model(problem, fit.estimate)
+    r, J, sigma, shared = problem.linear_model(fit.estimate)
     N, flat, p = shared.reshape(r.size, -1), J.reshape(r.size, -1), len(ALL)
     C = block_diag(*sigma) + N @ N.T
     whitening = Whitening.of(sigma, shared, np.ones(r.shape))
@@ -145,13 +146,13 @@ def test_found_parts_solve_the_likelihood_equation(room):
     """After the last step r^T P D P r = tr(P D) holds for the parts inside and across the image, written out dense."""
     case, _, _, recording = room
     problem = equation.Problem(
-        recording, equation.Spread(1.0, 1.0, 1.0), ALL[:-2], arms=equation.arm_errors(case.declared_arms, recording)
+        recording, equation.Spread(1.0, 1.0, 1.0), ALL[:-2], arms=arm_errors.arm_errors(case.declared_arms, recording)
     )
     fit = plain_fit(problem, drawing(case))
     for _ in range(6):
         problem = with_spreads(problem, fit)
         fit = plain_fit(problem, fit.estimate)
-    r, J, sigma, shared = equation.linear_model(problem, fit.estimate)
+    r, J, sigma, shared = problem.linear_model(fit.estimate)
     image = recording.A[:, :3, :3] @ fit.estimate.R_X
     N, J = shared.reshape(r.size, -1), J.reshape(r.size, -1)
     V = np.linalg.inv(block_diag(*sigma) + N @ N.T)

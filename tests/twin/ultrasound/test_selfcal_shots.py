@@ -11,10 +11,11 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.errors import ArmErrors
+from puncture_twin.planning.geometry.gauss_newton import whitener
 from puncture_twin.run_twin import main
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import ShotByShot, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import DeclaredArm, DeclaredArms, Problem, linear_model
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import whitener
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.recording_file import write_recording
 from puncture_twin.twin.jobs.exit_codes import OK
@@ -51,7 +52,7 @@ def test_shots_are_the_batch_to_linearisation(taken):
     shots = recording.subset(slice(FIRST, ALL))
     tips = Recording(shots.A, shots.B, shots.P)
     plain = calibrate(recording.subset(slice(0, FIRST)), noise=SPEC_NOISE, direction=False)
-    r, J, sigma, _ = linear_model(Problem(tips, SPEC_NOISE, np.arange(15), 0.0), plain.estimate)
+    r, J, sigma, _ = Problem(tips, SPEC_NOISE, np.arange(15), 0.0).linear_model(plain.estimate)
     W = whitener(sigma, np.ones(r.shape))
     prior = np.linalg.inv(np.linalg.cholesky(plain.covariance))
     rows = np.concatenate([prior, (W @ J).reshape(-1, 15)])

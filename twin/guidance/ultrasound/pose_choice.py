@@ -33,19 +33,12 @@ from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.collision.bodies import surface, touch
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.two_arms import BetweenArms, handle_tool, head_body
+from puncture_twin.planning.geometry.gauss_newton import whitener
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, frame_yz, pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
-    DeclaredArms,
-    Estimate,
-    Problem,
-    active_columns,
-    arm_errors,
-    linear_model,
-    parameter_units,
-)
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import whitener
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import Estimate, Problem, active_columns, parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import PhantomSection, SelfcalCase
 
@@ -378,7 +371,7 @@ def _slopes(recording: Recording, belief: _Belief) -> tuple[Floats, Floats]:
     """Residuals by parameters in their units and by the arms' errors, (n, 3, p), and their own noise, (n, 3, 3)."""
     active = active_columns(scale=False, direction=False)
     errors = None if belief.arms is None else arm_errors(belief.arms, recording)
-    model = linear_model(Problem(recording, belief.noise, active, arms=errors), belief.prior)
+    model = Problem(recording, belief.noise, active, arms=errors).linear_model(belief.prior)
     J = model.jacobian * parameter_units(active, belief.prior.scale)
     return (J if model.shared is None else np.concatenate([J, model.shared], axis=2)), model.sigma
 

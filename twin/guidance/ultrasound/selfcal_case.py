@@ -16,7 +16,7 @@ from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_to
 from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.case.tables import Length, Name, Number, Section, Sextuple, Vector
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import DeclaredArm, DeclaredArms
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.needle_detector import Imager, NeedleEcho
 

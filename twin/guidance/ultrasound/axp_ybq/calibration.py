@@ -15,6 +15,7 @@ e^T (S + H L^-1 H^T)^-1 e is chi-squared where the shot belongs to the others; o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,46 +23,39 @@ import numpy as np
 from scipy.special import gammaincinv
 from scipy.stats import chi2, f
 
-from puncture_twin.planning.base.arrays import Floats, Ints, read_only
-from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, read_only
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.text import Shown, brief, plural
 from puncture_twin.planning.geometry.rigid import log_rotation, pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
     DIRECTION,
     LEAST_POSES,
     N_PARAMETERS,
     PARAMETERS,
+    REVERSED,
     T_Q,
     UNWEIGHTED,
-    DeclaredArms,
     Estimate,
     Problem,
     SeenDirection,
     Spread,
     active_columns,
-    arm_errors,
     closed_form,
-    corrected,
-    direction_findings,
-    linear_model,
+    counted,
     linearised_tip,
-    needle_direction,
     needle_in_image,
     tangent_basis,
     tip_points,
-    without_play,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import (
     ImageErrors,
-    RobustFit,
     SmallSample,
-    image_errors,
-    refitted,
-    robust_fit,
+    Solution,
     small_sample,
+    solve,
     weighed,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, require_observable
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 
 LARGEST_RATIO = 1.1
@@ -155,7 +149,7 @@ class Calibration(Shown):
         """
         errors = None if self.arms is None else arm_errors(self.arms, poses)
         active = self.active[self.active < DIRECTION.start]
-        model = linear_model(Problem(poses, NO_NOISE, active, arms=errors), self.estimate)
+        model = Problem(poses, NO_NOISE, active, arms=errors).linear_model(self.estimate)
         J, rows = model.jacobian, np.arange(len(active))
         if model.shared is not None:
             J = np.concatenate([J, model.shared], axis=2)
@@ -218,15 +212,13 @@ class Calibration(Shown):
         return float(p * f.ppf(level, p, max(self.freedom / per_pose, 1.0)))
 
 
-def calibration_of(
-    problem: Problem, fit: RobustFit, observability: Observability, seen: SeenDirection, cannot_show: tuple[str, ...],
-    arms: DeclaredArms | None,
-) -> Calibration:  # fmt: skip
-    """The calibration at a fit, with the needle's direction before it took part and what the poses cannot show."""
+def calibration_of(solution: Solution, cannot_show: tuple[str, ...], arms: DeclaredArms | None) -> Calibration:
+    """The calibration of a solution, with what the poses cannot show."""
+    problem, fit, observability, seen, image = solution
     at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
     freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
     residuals, names = at_fit.residuals[:, :3], problem.recording.names
-    image, findings = image_errors(problem, fit), [*direction_findings(names, kept & ~fit.direction_kept, seen)]
+    findings = [*direction_findings(names, kept & ~fit.direction_kept, seen)]
     if image is not None and image.significant:
         findings.append(image.finding())
     return Calibration(
@@ -258,6 +250,26 @@ def calibration_of(
         joint_covariance=read_only(at_fit.covariance),
         small_sample=small_sample(problem, fit) if problem.arms is not None else None,
     )
+
+
+FEW = 0.1
+"""Fraction of the directions that may be set aside without a warning: single ones are, in one true recording of 20."""
+
+
+def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection) -> Iterator[Finding]:
+    """Directions set aside (n,) though their tip was used, those that are reversed, and whether their sign is known."""
+    for code, rows, problem, most in (
+        ("directions_reversed", seen.reversed, REVERSED, 0.0),
+        ("directions_aside", aside & ~seen.reversed, "v contradicts the other poses", FEW),
+    ):
+        if rows.any():
+            severity = Severity.WARNING if rows.mean() > most else Severity.NOTE
+            text = f"{counted(names, rows, problem)}; these directions were set aside"
+            yield Finding(code, severity, text, {"count": float(rows.sum())})
+    if not seen.sign_known:
+        said = "the tip is not on the measured axis of the needle"
+        text = f"{said}: its sense, taken from most directions, could not be checked"
+        yield Finding("direction_sign", Severity.WARNING, text)
 
 
 def with_length(found: Calibration, length_mm: float) -> Calibration:
@@ -332,17 +344,16 @@ def calibrate(
     # 1. Where to begin.
     errors = None if arms is None else arm_errors(arms, recording)
     poses = recording if errors is None else without_play(recording, errors)
-    estimate = closed_form(poses, scale=scale)
+    problem = Problem(poses, noise or UNWEIGHTED, active_columns(scale=scale, direction=False), arms=errors)
+    start = closed_form(poses, scale=scale)
     # 2. The fit: outliers, observability, directions, noise.
-    active = active_columns(scale=scale, direction=False)
-    problem = Problem(poses, noise or UNWEIGHTED, active, arms=errors)
-    solved = _solve(problem, estimate, direction=direction and recording.v is not None)
+    solution = solve(problem, start, direction=direction and recording.v is not None)
     # 3. What the recording cannot show, and the result with its covariance.
     cannot = [SHAFT_BIAS] * (needle_length_mm is None)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
     if arms is not None and recording.turn_probe is None and any(arm.errors.backlash > 0.0 for arm in arms):
         cannot.append(PLAY_SIGN)
-    found = calibration_of(*solved, tuple(cannot), arms)
+    found = calibration_of(solution, tuple(cannot), arms)
     return found if needle_length_mm is None else with_length(found, needle_length_mm)
 
 
@@ -356,30 +367,6 @@ def _check(recording: Recording, scale: bool) -> None:
         missed = f" (and {plural(len(recording.missed), 'picture')} without a needle)" if recording.missed else ""
         allowed = f"{least} or more, preferably {ADVISED_POSES}"
         refuse(plural(len(recording), "pose") + missed, "recording", allowed, "too_few_poses")
-
-
-def _solve(
-    problem: Problem, start: Estimate, *, direction: bool
-) -> tuple[Problem, RobustFit, Observability, SeenDirection]:
-    """Fit the tips, require that all unknowns are observable, then fit again with directions and estimated noise."""
-    recording = problem.recording
-    fit = robust_fit(problem, start)
-    try:
-        seen = needle_direction(fit.estimate, recording, fit.tip_kept)
-    except InputError:  # directions say little of poses that show too little
-        require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
-        raise
-    fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
-    observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
-    if direction:
-        active = np.append(problem.active, [DIRECTION.start, DIRECTION.start + 1])
-        problem = problem._replace(active=active, lean_rad=seen.lean_rad)
-    if isinstance(problem.noise, Spread) or problem.with_direction:
-        before = fit.tip_kept
-        problem, fit = refitted(problem, fit, seen)
-        if not np.array_equal(before, fit.tip_kept):
-            observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
-    return problem, fit, observability, seen
 
 
 FALSE_ALARM = 1e-3
@@ -434,7 +421,7 @@ class ShotByShot(Shown):
         if errors is not None:
             pose = without_play(pose, errors)
         active = start.active if pose.v is not None else start.active[start.active < DIRECTION.start]
-        model = linear_model(Problem(pose, start.noise, active, start.lean_rad, errors), start.estimate)
+        model = Problem(pose, start.noise, active, start.lean_rad, errors).linear_model(start.estimate)
         r, S, H = model.residuals[0], model.sigma[0], np.zeros((len(model.residuals[0]), len(self.vector)))
         if pose.v is not None and len(r) == 5:  # against the start's directions, not against itself
             longer = (pose.shaft_unit / start.shaft_unit) ** 2

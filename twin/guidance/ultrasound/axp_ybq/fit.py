@@ -1,11 +1,6 @@
 """The fit: weighted least squares (Gauss-Newton on the rotations' tangent space), outliers, and the noise it shows.
 
-Each pose's own noise Omega_i is whitened alone. Errors that all poses share (N per standard deviation of each) couple
-the poses: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1/2 N
-
-    C^-1/2 = (I + S S^T)^-1/2 Omega^-1/2,   (I + S S^T)^-1/2 = I - S V diag(1 / (s (s + 1))) V^T S^T,   s^2 = 1 + d^2,
-
-where S^T S = V diag(d^2) V^T. The same estimate comes from taking the shared errors as unknowns with a prior.
+`solve` is its list of stages. The equation and its linearisation are those of `equation.py`.
 
 Single wrong poses do not bend it:
 1. Fit all. If no studentised residual stands out, that is the answer, at full efficiency.
@@ -31,66 +26,24 @@ from scipy.special import gammaincinv
 from scipy.stats import f
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import Finding, Severity, refuse
-from puncture_twin.planning.geometry.gauss_newton import Fit, System, gauss_newton, lacking
+from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
+from puncture_twin.planning.geometry.gauss_newton import Fit, Whitening, gauss_newton, lacking, whitener
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
     DIRECTION,
-    LEAST_MM,
+    HALF_NORMAL,
     SCALE,
     Estimate,
     Problem,
     SeenDirection,
     Spread,
-    Weights,
+    WeightedProblem,
     directions_image,
-    facing,
-    linear_model,
     linearised_tip,
-    median_spread,
-    parameter_units,
-    residual_weights,
-    residuals,
+    needle_direction,
+    needle_in_image,
+    tip_residuals,
 )
-
-LEAST_WEIGHT = 1e-12
-"""A pose that is set aside keeps this weight: its residual's standard deviation is a million times as large."""
-
-
-def whitener(sigma: Floats, weights: Floats) -> Floats:
-    """W (n, k, k) with W^T W the inverse of sigma (n, k, k), each times its weight (n, k); 0 sets a residual aside."""
-    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))  # a weight divides the variance
-    scaled = sigma * spread[:, :, None] * spread[:, None, :]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)))
-
-
-class Whitening(NamedTuple):
-    """C^-1/2: the whitener of each pose alone (n, k, k), S (n k, m) or None, and V diag(1 / (s (s + 1))) V^T (m, m)."""
-
-    own: Floats  # whitener of each pose alone, shape (n, k, k)
-    shared: Floats | None  # s, shape (n k, m); None where nothing is shared
-    inner: Floats  # v diag(1 / (s (s + 1))) V^T, shape (m, m)
-
-    @classmethod
-    def of(cls, sigma: Floats, slopes: Floats | None, weights: Floats) -> Whitening:
-        """C^-1/2 of poses with noise of their own, sigma (n, k, k), and in common, N (n, k, m); weights (n, k)."""
-        own = whitener(sigma, weights)
-        if slopes is None:
-            return cls(own, None, np.zeros((0, 0)))
-        shared = (own @ slopes).reshape(-1, slopes.shape[2])
-        squared, V = np.linalg.eigh(shared.T @ shared)
-        s = np.sqrt(1.0 + np.maximum(squared, 0.0))  # s^2 = 1 + d^2
-        return cls(own, shared, (V / (s * (s + 1.0))) @ V.T)
-
-    def residuals(self, r: Floats) -> Floats:
-        """Whitened residuals (n, k), shape (n k,)."""
-        return self._coupled((self.own @ r[:, :, None]).reshape(-1))
-
-    def slopes(self, J: Floats) -> Floats:
-        """Whitened slopes (n, k, p), shape (n k, p)."""
-        return self._coupled((self.own @ J).reshape(-1, J.shape[2]))
-
-    def _coupled(self, x: Floats) -> Floats:
-        return x if self.shared is None else np.asarray(x - self.shared @ (self.inner @ (self.shared.T @ x)))
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, require_observable
 
 
 class RobustFit(NamedTuple):
@@ -100,6 +53,36 @@ class RobustFit(NamedTuple):
     tip_kept: Bools  # shape (n,): the tip of this pose was used
     direction_kept: Bools  # shape (n,): its direction was used
     iterations: int
+
+
+Weights = Floats | Bools
+MAX_STEPS = 50
+"""A good start needs five; what has not settled after fifty does not."""
+SMALL_STEP = 1e-7
+"""A step whose largest part (rad, 100 mm) is smaller ends the refinement: it is off by less than 1e-5 mm."""
+
+
+def residual_weights(problem: Problem, tip_weights: Weights, direction_weights: Weights) -> Floats:
+    """One weight per residual, shape (n, k), from one per pose for tip and direction (a flag counts as 1 or 0)."""
+    columns = [tip_weights] * 3 + [direction_weights] * (2 if problem.with_direction else 0)
+    return np.column_stack(columns).astype(np.float64)
+
+
+def refine(
+    problem: Problem, start: Estimate, tip_weights: Weights, direction_weights: Weights, *, max_steps: int = MAX_STEPS
+) -> Fit[Estimate]:
+    """The estimate of least weighted squares near a start; the pose covariances follow the estimate.
+
+    Weights are one per pose for its tip and for its direction, (n,); a flag counts as 1 or 0.
+    """
+    weighted = WeightedProblem(problem, residual_weights(problem, tip_weights, direction_weights))
+    return gauss_newton(
+        start,
+        weighted.linearised,
+        weighted.moved,
+        lambda _, step: bool(np.abs(step).max() < SMALL_STEP),
+        max_steps,
+    )
 
 
 class Fitted(NamedTuple):
@@ -122,7 +105,7 @@ class Fitted(NamedTuple):
 def weighed(problem: Problem, fit: RobustFit) -> Fitted:
     """A problem linearised at its fit, with the poses that made it."""
     weights = residual_weights(problem, fit.tip_kept, fit.direction_kept)
-    r, J, sigma, N = linear_model(problem, fit.estimate)
+    r, J, sigma, N = problem.linear_model(fit.estimate)
     W, p = whitener(sigma, weights), J.shape[2]
     if N is not None:
         J = np.concatenate([J, N], axis=2)
@@ -137,44 +120,23 @@ def weighed(problem: Problem, fit: RobustFit) -> Fitted:
     return Fitted(r, J, sigma, (W @ r[:, :, None])[:, :, 0], C, shared, W)
 
 
-MAX_STEPS = 50
-"""A good start needs five; what has not settled after fifty does not."""
-SMALL_STEP = 1e-7
-"""A step whose largest part (rad, 100 mm) is smaller ends the refinement: it is off by less than 1e-5 mm."""
-
-
-def refine(
-    problem: Problem, start: Estimate, tip_weights: Weights, direction_weights: Weights, *, max_steps: int = MAX_STEPS
-) -> Fit[Estimate]:
-    """The estimate of least weighted squares near a start; the pose covariances follow the estimate.
-
-    Weights are one per pose for its tip and for its direction, (n,); a flag counts as 1 or 0.
-    """
-
-    def linearised(estimate: Estimate) -> System[Estimate]:
-        model = linear_model(problem, estimate)
-        weights = residual_weights(problem, tip_weights, direction_weights)
-        whitening = Whitening.of(model.sigma, model.shared, weights)
-        return System(
-            whitening.residuals(model.residuals),
-            whitening.slopes(model.jacobian) * parameter_units(problem.active, estimate.scale),
-            lambda near: float(np.sum(whitening.residuals(residuals(problem, near)) ** 2)),
-        )
-
-    return gauss_newton(
-        start,
-        linearised,
-        lambda estimate, step: estimate.moved_by(problem.active, step),
-        lambda _, step: bool(np.abs(step).max() < SMALL_STEP),
-        max_steps,
-    )
-
-
 def plain_fit(problem: Problem, start: Estimate) -> RobustFit:
     """Least squares over all poses."""
     every = np.ones(len(problem.recording), dtype=bool)
     fit = refine(problem, start, every, every)
     return RobustFit(fit.estimate, every, every, fit.iterations)
+
+
+LEAST_MM = 1e-9
+"""Below this there is no noise, only rounding."""
+
+
+def median_spread(problem: Problem, estimate: Estimate) -> Spread:
+    """The tip's spread inside and across the image, from medians: outliers hardly move it."""
+    to_image = (problem.recording.A[:, :3, :3] @ estimate.R_X).transpose(0, 2, 1)
+    r = np.abs(to_image @ tip_residuals(estimate, problem.recording)[:, :, None])[:, :, 0]
+    inside, across = (max(float(np.median(part)) / HALF_NORMAL, LEAST_MM) for part in (r[:, :2], r[:, 2]))
+    return Spread(max(inside, across / 3), max(across, inside / 3), 1.0)
 
 
 def robust_fit(problem: Problem, start: Estimate) -> RobustFit:
@@ -229,7 +191,7 @@ def reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
     """Huber, then Tukey; every pose still counts as used, with a weight below 1."""
     estimate, weights = fit.estimate, [np.ones(len(problem.recording))] * 2
     for step in range(HUBER_STEPS + TUKEY_STEPS):
-        r, _, sigma, shared = linear_model(problem, estimate)
+        r, _, sigma, shared = problem.linear_model(estimate)
         if shared is not None:
             sigma = sigma + shared @ shared.transpose(0, 2, 1)
         for k, block in enumerate(blocks(problem)):
@@ -268,7 +230,14 @@ def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[
             kept.append(size <= block.limit * scale(size[used], block, ALARM_FRACTION))
         else:
             kept.append(standardised(r, S, _axes(problem, fit.estimate, block), block, used) <= block.limit)
-    return kept[0], kept[1] & facing(fit.estimate, problem.recording) if problem.with_direction else fit.direction_kept
+    return kept[0], kept[1] & facing(problem, fit.estimate) if problem.with_direction else fit.direction_kept
+
+
+def facing(problem: Problem, estimate: Estimate) -> Bools:
+    """Poses whose measured direction points along V at all, shape (n,): a reversed one has no residual."""
+    recording = problem.recording
+    m = needle_in_image(estimate, recording) @ estimate.V
+    return np.asarray(np.einsum("ni,ni->n", m, directions_image(recording, estimate)) > 0)
 
 
 class Block(NamedTuple):
@@ -575,7 +544,7 @@ class ImageErrors(NamedTuple):
 def image_errors(problem: Problem, fit: RobustFit) -> ImageErrors | None:
     """The errors of the image at a fit; None where the poses cannot show them."""
     weights = residual_weights(problem, fit.tip_kept, fit.direction_kept)
-    model = linear_model(problem, fit.estimate)
+    model = problem.linear_model(fit.estimate)
     free = SCALE.start not in problem.active
     wanted = np.array([free, free, True, problem.with_direction])
     recording, estimate = problem.recording, fit.estimate
@@ -597,3 +566,35 @@ def image_errors(problem: Problem, fit: RobustFit) -> ImageErrors | None:
     left = (columns @ found.found - model.jacobian @ pulled)[fit.tip_kept, :3]
     rms = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
     return ImageErrors(tuple(np.array(list(ERRORS))[wanted].tolist()), found.found, found.sd, found.probability, rms)
+
+
+class Solution(NamedTuple):
+    """What `solve` found."""
+
+    problem: Problem  # with the noise that the residuals show
+    fit: RobustFit
+    observability: Observability
+    seen: SeenDirection  # before the directions took part
+    image: ImageErrors | None  # None where the poses cannot show errors of the image
+
+
+def solve(problem: Problem, start: Estimate, *, direction: bool) -> Solution:
+    """Fit the tips, require that all unknowns are observable, then fit again with directions and estimated noise."""
+    recording = problem.recording
+    fit = robust_fit(problem, start)
+    try:
+        seen = needle_direction(fit.estimate, recording, fit.tip_kept)
+    except InputError:  # directions say little of poses that show too little
+        require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+        raise
+    fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
+    observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+    if direction:
+        active = np.append(problem.active, [DIRECTION.start, DIRECTION.start + 1])
+        problem = problem._replace(active=active, lean_rad=seen.lean_rad)
+    if isinstance(problem.noise, Spread) or problem.with_direction:
+        before = fit.tip_kept
+        problem, fit = refitted(problem, fit, seen)
+        if not np.array_equal(before, fit.tip_kept):
+            observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+    return Solution(problem, fit, observability, seen, image_errors(problem, fit))

@@ -34,6 +34,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
     needle_in_image,
     parameter_units,
     tip_points,
+    tips_image,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
@@ -111,7 +112,7 @@ def _named(
             text = f"the {arm} rotates about one axis only: {slides} along it"
             yield IllConditionedMotion(f"{arm}_axis", count, text)
     # w_X = k with t_X so that the mean tip stays: the image turns about the tip, or about the line of all tips
-    mean_tip = recording.points_image(estimate.scale).mean(axis=0) / LENGTH_MM
+    mean_tip = tips_image(recording, estimate.scale).mean(axis=0) / LENGTH_MM
     tip[W_X], tip[T_X] = np.eye(3), estimate.R_X @ skew(mean_tip)
     count, _ = _ill_conditioned_part(J, active, tip, limit)
     if count == 3:
@@ -235,7 +236,7 @@ class _Move(NamedTuple):
 
 
 def _changed(estimate: Estimate, recording: Recording, row: int, move: _Move) -> PoseChange:
-    A, p = recording.A[row], recording.points_image(estimate.scale)[row]
+    A, p = recording.A[row], tips_image(recording, estimate.scale)[row]
     M, tip_end1 = needle_in_image(estimate, recording)[row], estimate.R_X @ p + estimate.t_X
     rotated = A[:3, :3] @ estimate.R_X @ exp_rotation(np.array(move.turn))  # about the tip
     R_A = rotated @ estimate.R_X.T

@@ -118,13 +118,6 @@ class Recording(Shown):
         """Root mean square of what the shafts' lengths say of the directions' spreads; 1 where nothing does."""
         return 1.0 if self.shaft_mm is None else float(np.sqrt(np.mean(self.shaft_mm ** (-2 * SHAFT_POWER))))
 
-    def points_image(self, scale: Floats) -> Floats:
-        """The tips, shape (n, 3), mm, by the mm per unit of P along u and v, shape (2,); a plane has z = 0."""
-        points = np.zeros((len(self), 3))
-        points[:, : self.P.shape[1]] = self.P
-        points[:, :2] *= scale
-        return points
-
     def __len__(self) -> int:
         return len(self.names)
 
