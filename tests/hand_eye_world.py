@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from puncture_twin.planning.formats.pose_table import pose_columns, pose_values, table_text
+from puncture_twin.planning.formats.csv_table import pose_columns, pose_values, table_text
 from puncture_twin.planning.geometry.rigid import exp_rotation, inverse, pose
 from puncture_twin.planning.registration.hand_eye import PosePairs
 

@@ -10,10 +10,8 @@ formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the
 from __future__ import annotations
 
 import csv
-import io
-import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -27,6 +25,7 @@ from puncture_twin.planning.base.errors import InputError, refuse, refusing
 from puncture_twin.planning.base.files import atomic, decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import Facts, Shown, brief
+from puncture_twin.planning.formats.csv_table import csv_lines, parse_coordinate, row_numbers
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps
 
@@ -141,31 +140,10 @@ class RawPoints(NamedTuple):
     joints_deg: list[tuple[float, ...]] | None = None  # six angles per point, if it says how the robot stood there
 
 
-def parse_coordinate(text: str, where: str) -> float:
-    """A finite decimal number. Raises InputError: anything else, such as a decimal comma, NaN or an empty field."""
-    allowed = "a finite number with a decimal point"
-    if "_" in text:  # Python would read 1_0 as 10
-        refuse(f"{text[:40]!r} is not a number", where, allowed, "not_a_number")
-    try:
-        number = float(text)
-    except ValueError as error:
-        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed, code="not_a_number") from error
-    if not math.isfinite(number):
-        refuse(f"{text[:40]!r} is not finite", where, allowed, "not_finite")
-    return number
-
-
 _ALLOWED = (
     "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "
     "then as many fields in every line"
 )
-
-
-class CsvLine(NamedTuple):
-    """A line of a CSV: its number in the file, from 1, and its fields."""
-
-    line: int
-    fields: list[str]
 
 
 def read_csv_points(data: bytes, where: str) -> RawPoints:
@@ -203,18 +181,6 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
     kinds = tuple(fields[columns["kind"]].strip() for _, fields in placed) if "kind" in columns else None
     turned = [tuple(row_numbers(fields, header, JOINTS_DEG, place)) for place, fields in placed] if joints else None
     return RawPoints(names, points, unit, None, kinds, turned)
-
-
-def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
-    """The lines of a CSV that are not empty. Raises InputError: it is none; names the line, and what is ``allowed``."""
-    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
-    try:
-        for fields in reader:
-            if any(field.strip() for field in fields):
-                yield CsvLine(reader.line_num, fields)
-    except csv.Error as error:
-        place = f"{where}, line {reader.line_num}"
-        raise InputError(f"is not a CSV file ({error})", where=place, allowed=allowed, code="not_csv") from error
 
 
 _MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
@@ -400,13 +366,6 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     names = names or tuple(str(i) for i in range(1, len(rows)))
     torque_nm = table[:, 6 + bool(time) :][:, :6] if torques else None
     return JointRecording(names, q, times, 1000.0 * table[:, -3:] if tool else None, torque_nm)
-
-
-def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str], where: str) -> list[float]:
-    """A row's numbers in the columns wanted. Raises InputError: fields unlike the header, or one that is not finite."""
-    if len(row) != len(header):
-        refuse(f"{len(row)} fields", where, f"{len(header)} fields, as in the header", "ragged_row")
-    return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]
 
 
 def named_points(points: NamedPoints | Mapping[str, ArrayLike], where: str) -> NamedPoints:

@@ -32,7 +32,7 @@ from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.text import Shown, brief
-from puncture_twin.planning.formats.pose_table import parse_table, pose_columns, pose_names, poses_of, rigid_poses
+from puncture_twin.planning.formats.csv_table import Layout, parse_table, pose_columns, pose_names, rigid_poses
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import exp_rotation, inverse, log_rotation, nearest_rotation, pose, skew
 
@@ -118,10 +118,10 @@ def read_pose_pairs(path: Path, *, motions: bool = False) -> PosePairs:
     Raises InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
     """
     content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
-    groups = {letter: pose_columns(letter) for letter in "AB"}
-    table = parse_table(content, path, groups, lambda found: len(found) == 2, ("A", "B"))
+    layout = Layout({letter: pose_columns(letter) for letter in "AB"}, (frozenset("A"), frozenset("B")))
+    table = parse_table(content, path, layout, ("A", "B"))
     try:
-        return PosePairs(poses_of(table.numbers["A"]), poses_of(table.numbers["B"]), table.names, motions)
+        return PosePairs(table.poses["A"], table.poses["B"], table.names, motions)
     except InputError as error:
         raise error.at(f"{path}: {error.where}") from error
 

@@ -19,10 +19,9 @@ from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.formats.csv_table import csv_lines, parse_coordinate
 from puncture_twin.planning.formats.points import (
     MAX_FILE_BYTES,
-    csv_lines,
-    parse_coordinate,
     parse_points,
     parse_triple,
     typed_point,

@@ -6,8 +6,8 @@ from puncture_twin.planning.arm.dynamics import JointMotion
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.formats.csv_table import table_text
 from puncture_twin.planning.formats.points import JOINTS_DEG, TORQUES
-from puncture_twin.planning.formats.pose_table import table_text
 from puncture_twin.twin.world.control import rigid_model
 
 FRICTION, NOISE = 0.05, 0.002

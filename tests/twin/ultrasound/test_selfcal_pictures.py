@@ -19,7 +19,7 @@ from refusals import refused, refused_command
 from selfcal_world import as_estimate
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.pose_table import pose_columns, pose_values, table_text
+from puncture_twin.planning.formats.csv_table import pose_columns, pose_values, table_text
 from puncture_twin.run_twin import main
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import tip_residuals

@@ -23,8 +23,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import is_plain_file, read_input
 from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.formats.csv_table import Layout, parse_table, table_text
 from puncture_twin.planning.formats.points import NamedPoints, joint_readings, read_points, write_points
-from puncture_twin.planning.formats.pose_table import parse_table, table_text
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Unit
 from puncture_twin.planning.registration.fits import fit_rigid
@@ -544,8 +544,8 @@ def read_recording(folder: Path, size_px: tuple[int, int]) -> Replay:
     for table, header in COLUMNS.items():
         path = folder / f"{table}.csv"
         content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
-        groups = {"all": header[1:]}
-        names, numbers, _ = parse_table(content, path, groups, bool, ("all",), first=header[0])
+        layout = Layout({"all": header[1:]}, (frozenset({"all"}),))
+        names, numbers, *_ = parse_table(content, path, layout, ("all",), first=header[0])
         if table == MARKERS and len(set(names)) < len(names):
             refuse(f"a marker appears twice: {', '.join(names)}", path, "each name once", "duplicate_name")
         tables[table] = RecordedTable(names, numbers["all"])

@@ -11,7 +11,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Ints, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count, uncounted
-from puncture_twin.planning.formats.pose_table import table_text
+from puncture_twin.planning.formats.csv_table import table_text
 from puncture_twin.twin.devices import Arm, JogOperator, Probe
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection, Missed, detect

@@ -23,16 +23,16 @@ from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic, is_folder, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.formats.points import joint_readings
-from puncture_twin.planning.formats.pose_table import (
+from puncture_twin.planning.formats.csv_table import (
     GroupedTable,
+    Layout,
     parse_table,
     pose_columns,
     pose_names,
     pose_values,
-    poses_of,
     table_text,
 )
+from puncture_twin.planning.formats.points import joint_readings
 from puncture_twin.planning.geometry.rigid import inverse, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import OPTIONAL, Recording
@@ -71,10 +71,22 @@ GROUPS = MappingProxyType(
 )
 """Columns behind the name, in their order."""
 
-NEEDS = MappingProxyType(
-    {"P_w": "P_mm", "v_z": "v", "shaft": "v", "frame": "picture", "pixel": "picture", "turn": "q", "A": "B", "B": "A"}
+LAYOUT = Layout(
+    GROUPS,
+    any_of=(frozenset({"A", "q"}),),
+    one_of=frozenset({"P_mm", "P_px", "picture"}),
+    needs={
+        "P_w": "P_mm",
+        "v_z": "v",
+        "shaft": "v",
+        "frame": "picture",
+        "pixel": "picture",
+        "turn": "q",
+        "A": "B",
+        "B": "A",
+    },
 )
-"""A group that only stands beside another one."""
+"""Poses or joints, and one of three statements of where the tip is."""
 COVERED = "something coloured covers the needle's tip"
 PIXEL_MM = (0.01, 2.0)
 """Least and largest size of a pixel."""
@@ -110,7 +122,7 @@ def open_recording(path: Path, case: SelfcalCase | None) -> ReadRecording:
     """
     file = recording_file(path)
     content = read_input(file, max_bytes=MAX_BYTES, where=str(file))
-    table = parse_table(content, file, GROUPS, _fits, ("A", "B", "P_mm", "v", "q"), texts=frozenset({"picture"}))
+    table = parse_table(content, file, LAYOUT, ("A", "B", "P_mm", "v", "q"), texts=frozenset({"picture"}))
     inputs = [content_input("recording", file.name, content)]
     seen = _seen(table, file, case, inputs) if "picture" in table.texts else None
     try:
@@ -119,12 +131,6 @@ def open_recording(path: Path, case: SelfcalCase | None) -> ReadRecording:
         raise error.at(f"{file}: {error.where}") from error
     warnings = () if seen is None else seen.warnings
     return ReadRecording(recording, tuple(inputs), (*unfinished_warnings(content, file.name), *warnings))
-
-
-def _fits(found: frozenset[str]) -> bool:
-    """Whether columns belong together: poses or joints, and one of the three ways to say where the tip is."""
-    whole = all(need in found for group, need in NEEDS.items() if group in found)
-    return whole and bool(found & {"A", "q"}) and len(found & {"P_mm", "P_px", "picture"}) == 1
 
 
 class _Seen(NamedTuple):
@@ -146,7 +152,7 @@ def _recording(table: GroupedTable, seen: _Seen | None, case: SelfcalCase | None
         both = np.split(numbers["q"], 2, axis=1)
         joints = [joint_readings(part, "deg", where="joints", names=names) for part in both]
     turns = np.split(numbers["turn"], 2, axis=1) if "turn" in numbers else [None, None]
-    poses = [poses_of(numbers[arm]) for arm in "AB" if arm in numbers]
+    poses = list(table.poses.values())
     if not poses:
         if case is None:
             refuse("joints alone", "header", "columns A_r11 .. B_z_mm, or a case that names the arms", "missing_column")

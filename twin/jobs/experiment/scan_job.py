@@ -18,8 +18,8 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.strict_json import array, fitting, parse_json
+from puncture_twin.planning.formats.csv_table import table_text
 from puncture_twin.planning.formats.points import write_points
-from puncture_twin.planning.formats.pose_table import table_text
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext

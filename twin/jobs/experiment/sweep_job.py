@@ -10,7 +10,7 @@ import numpy as np
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.formats.points import parse_coordinate
+from puncture_twin.planning.formats.csv_table import parse_coordinate
 from puncture_twin.planning.search.choice import Choice, choose, chosen_angles
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.sweep.sweep_planner import SweepPlan, plan_sweep

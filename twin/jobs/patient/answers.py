@@ -19,7 +19,8 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
-from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points, parse_triple
+from puncture_twin.planning.formats.csv_table import parse_coordinate
+from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_points, parse_triple
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement

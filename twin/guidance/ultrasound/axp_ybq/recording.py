@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import Shown, brief
+from puncture_twin.planning.formats.csv_table import finite_rows, pose_names, refuse_first, rigid_poses
 from puncture_twin.planning.formats.points import joint_readings
-from puncture_twin.planning.formats.pose_table import finite_rows, pose_names, refuse_first, rigid_poses
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
 """Optional arrays of a recording besides both flanges and the tip, with one row per pose."""

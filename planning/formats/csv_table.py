@@ -1,26 +1,81 @@
-"""A CSV whose columns come in groups, such as the twelve of a pose: read whole, or refused with file and line.
+"""CSV tables: lines, numbers, and tables whose columns come in groups, such as the twelve of a pose.
 
-The first column names the row; groups follow it in a fixed order, each whole or absent. Lines that start with # are
-passed over. A pose is nine numbers of its rotation, by rows, and its place in mm.
+A table is read whole, or refused with file and line. The first column names the row; groups follow it in a fixed
+order, each whole or absent. Lines that start with # are passed over. A pose is nine numbers of its rotation, by rows,
+and its place in mm.
 """
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
-from puncture_twin.planning.formats.points import csv_lines, row_numbers
 from puncture_twin.planning.geometry.rigid import pose
 
-Groups = Mapping[str, tuple[str, ...]]
-"""Columns by the name of their group, in the file's order."""
+
+class CsvLine(NamedTuple):
+    """A line of a CSV: its number in the file, from 1, and its fields."""
+
+    line: int
+    fields: list[str]
+
+
+def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
+    """The lines of a CSV that are not empty. Raises InputError: it is none; names the line, and what is ``allowed``."""
+    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
+    try:
+        for fields in reader:
+            if any(field.strip() for field in fields):
+                yield CsvLine(reader.line_num, fields)
+    except csv.Error as error:
+        place = f"{where}, line {reader.line_num}"
+        raise InputError(f"is not a CSV file ({error})", where=place, allowed=allowed, code="not_csv") from error
+
+
+def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str], where: str) -> list[float]:
+    """A row's numbers in the columns wanted. Raises InputError: fields unlike the header, or one that is not finite."""
+    if len(row) != len(header):
+        refuse(f"{len(row)} fields", where, f"{len(header)} fields, as in the header", "ragged_row")
+    return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]
+
+
+def parse_coordinate(text: str, where: str) -> float:
+    """A finite decimal number. Raises InputError: anything else, such as a decimal comma, NaN or an empty field."""
+    allowed = "a finite number with a decimal point"
+    if "_" in text:  # Python would read 1_0 as 10
+        refuse(f"{text[:40]!r} is not a number", where, allowed, "not_a_number")
+    try:
+        number = float(text)
+    except ValueError as error:
+        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed, code="not_a_number") from error
+    if not math.isfinite(number):
+        refuse(f"{text[:40]!r} is not finite", where, allowed, "not_finite")
+    return number
+
+
+class Layout(NamedTuple):
+    """Groups of columns that a table may have, and which of them belong together."""
+
+    groups: Mapping[str, tuple[str, ...]]  # columns by the name of their group, in the file's order
+    any_of: tuple[frozenset[str], ...]  # of each set one group or more is needed
+    one_of: frozenset[str] = frozenset()  # of these exactly one, where there are any
+    needs: Mapping[str, str] = MappingProxyType({})  # a group, and the one without which it does not stand
+
+    def allows(self, present: set[str]) -> bool:
+        """Whether these groups belong together."""
+        whole = all(need in present for group, need in self.needs.items() if group in present)
+        enough = all(present & some for some in self.any_of)
+        return whole and enough and (not self.one_of or len(present & self.one_of) == 1)
 
 
 class GroupedTable(NamedTuple):
@@ -28,14 +83,14 @@ class GroupedTable(NamedTuple):
 
     names: tuple[str, ...]
     numbers: Mapping[str, Floats]  # shape (n, k) of each group that is there
+    poses: Mapping[str, Floats]  # shape (n, 4, 4), mm, not yet checked, of each group that is a pose
     texts: Mapping[str, tuple[str, ...]]  # of each column of text that is there
 
 
 def parse_table(
     content: bytes,
     path: Path,
-    groups: Groups,
-    fits: Callable[[frozenset[str]], bool],
+    layout: Layout,
     example: Sequence[str],
     *,
     first: str = "name",
@@ -44,31 +99,33 @@ def parse_table(
     """The rows of a table. Raises InputError: another header, no row, one of another length, or no finite number.
 
     Args:
-        groups: Columns that it may have behind the first one.
-        fits: Whether the groups that are there belong together.
+        layout: Columns that it may have behind the first one.
         example: Groups of a usual file, for the error.
         texts: Groups of one column that is text.
     """
+    groups = layout.groups
     allowed = ", ".join((first, *(column for group in example for column in groups[group])))
-    lines = [one for one in csv_lines(content, str(path), allowed) if not one.fields[0].startswith("#")]
+    lines = [line for line in csv_lines(content, str(path), allowed) if not line.fields[0].startswith("#")]
     header = tuple(field.strip() for field in lines[0].fields) if lines else ()
-    found, at = [], 1
+    present, at = [], 1
     for group, columns in groups.items():
         if header[at : at + len(columns)] == columns:
-            found.append(group)
+            present.append(group)
             at += len(columns)
-    if header[:1] != (first,) or at != len(header) or not fits(frozenset(found)):
+    if header[:1] != (first,) or at != len(header) or not layout.allows({*present}):
         refuse(f"columns {', '.join(header)[:200] or 'none'}", f"{path}, header", allowed, "wrong_columns")
-    wanted = [column for group in found if group not in texts for column in groups[group]]
+    plain = [group for group in present if group not in texts]
+    wanted = [column for group in plain for column in groups[group]]
     rows = [row_numbers(fields, header, wanted, f"{path}, line {line}") for line, fields in lines[1:]]
     if not rows:
         refuse("no row", path, "one row or more", "empty")
-    plain = [group for group in found if group not in texts]
     parts = np.split(np.array(rows), np.cumsum([len(groups[group]) for group in plain])[:-1], axis=1)
-    words = {group: header.index(groups[group][0]) for group in found if group in texts}
+    numbers = dict(zip(plain, parts, strict=True))
+    poses = {group: _poses(part) for group, part in numbers.items() if groups[group] == pose_columns(group)}
     names = tuple(fields[0].strip() for _, fields in lines[1:])
-    said = {group: tuple(fields[at].strip() for _, fields in lines[1:]) for group, at in words.items()}
-    return GroupedTable(names, dict(zip(plain, parts, strict=True)), said)
+    at_text = {group: header.index(groups[group][0]) for group in present if group in texts}
+    stated = {group: tuple(fields[at].strip() for _, fields in lines[1:]) for group, at in at_text.items()}
+    return GroupedTable(names, numbers, poses, stated)
 
 
 def table_text(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -83,7 +140,7 @@ def pose_columns(letter: str) -> tuple[str, ...]:
     return (*(f"{letter}_r{i}{j}" for i in "123" for j in "123"), *(f"{letter}_{axis}_mm" for axis in "xyz"))
 
 
-def poses_of(values: Floats) -> Floats:
+def _poses(values: Floats) -> Floats:
     """Poses (n, 4, 4), mm, not yet checked, of their columns (n, 12)."""
     return pose(values[:, :9].reshape(-1, 3, 3), values[:, 9:])
 
