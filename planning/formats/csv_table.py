@@ -72,7 +72,7 @@ class Layout(NamedTuple):
     needs: Mapping[str, str] = MappingProxyType({})  # a group, and the one without which it does not stand
 
     def allows(self, present: set[str]) -> bool:
-        """Whether these groups belong together."""
+        """True where these groups belong together."""
         whole = all(need in present for group, need in self.needs.items() if group in present)
         enough = all(present & some for some in self.any_of)
         return whole and enough and (not self.one_of or len(present & self.one_of) == 1)

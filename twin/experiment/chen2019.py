@@ -65,21 +65,21 @@ def printed_errors(touched: tuple[Floats, ...]) -> dict[str, Floats]:
     """Every printed error of n experiments, by name, (n,), mm, of touches (n, 8, 3) in each setup, rows as `NAMES`."""
     by_triad = list(triad_errors(touched, READ).items())
     residuals = _misses(_fitted(fit_triad, touched[0], READ, "ABC"), touched[0], READ, "ABC")
-    found = dict([*by_triad[:2], ("mean residual of A-B-C, setup 1", residuals.mean(axis=1)), *by_triad[2:]])
+    errors = dict([*by_triad[:2], ("mean residual of A-B-C, setup 1", residuals.mean(axis=1)), *by_triad[2:]])
     for setup, markers, lesion in AFFINE:
         T = np.array([fit_affine(READ[rows_of(markers)], one[rows_of(markers)]) for one in touched[setup]])
         misses = _misses(T, touched[setup], READ, lesion)[:, 0]
-        found[f"{lesion} by {'-'.join(markers)} (affine), setup {setup + 1}"] = misses
-    return found
+        errors[f"{lesion} by {'-'.join(markers)} (affine), setup {setup + 1}"] = misses
+    return errors
 
 
 def triad_errors(touched: tuple[Floats, ...], read: Floats) -> dict[str, Floats]:
     """The errors of Tables 3 and 5 of n experiments, (n,) each, mm, of points ``read`` (8, 3) in the CT."""
-    found = {}
+    errors = {}
     for setup, markers, lesion in TRIADS:
         T = _fitted(fit_triad, touched[setup], read, markers)
-        found[f"{lesion} by {'-'.join(markers)}, setup {setup + 1}"] = _misses(T, touched[setup], read, lesion)[:, 0]
-    return found
+        errors[f"{lesion} by {'-'.join(markers)}, setup {setup + 1}"] = _misses(T, touched[setup], read, lesion)[:, 0]
+    return errors
 
 
 def _fitted(fit: Callable[[Floats, Floats], Floats], touched: Floats, read: Floats, names: str) -> Floats:
@@ -111,11 +111,11 @@ STRAINS: Mapping[str, tuple[int, int]] = {
 
 def rigid_residuals(touched: tuple[Floats, ...]) -> tuple[Floats, ...]:
     """Residuals of each setup: touched minus fitted by its points, CT axes, (n, p, 3), from touches (n, 8, 3), mm."""
-    found = []
+    residuals = []
     for names, points in zip(POINTS, touched, strict=True):
         T = _fitted(fit_rigid, points, READ, names)
-        found.append(_residuals(T, points, READ, names) @ T[:, :3, :3])  # R^T r: into CT axes
-    return tuple(found)
+        residuals.append(_residuals(T, points, READ, names) @ T[:, :3, :3])  # R^T r: into CT axes
+    return tuple(residuals)
 
 
 def axis_squares(residuals: tuple[Floats, ...]) -> Floats:
@@ -282,9 +282,9 @@ def find_skew() -> Skew:
 
 def unskewed(points: Floats, k: float) -> Floats:
     """Points (n, 3) with y moved by k along z, mm."""
-    moved = points.copy()
-    moved[:, 1] += k * points[:, 2]
-    return moved
+    unskewed_points = points.copy()
+    unskewed_points[:, 1] += k * points[:, 2]
+    return unskewed_points
 
 
 TRIPLES = tuple("".join(one) for one in combinations(MARKERS, 3))

@@ -146,7 +146,7 @@ def _shadow(imager: Imager, needle: NeedleInImage, echo: NeedleEcho) -> Floats:
     sorted_u = points[order, 0]
     under = (u >= sorted_u[0]) & (u <= sorted_u[-1])
     depth = np.interp(u, sorted_u, points[order, 1])
-    kept = 1.0 - echo.shadow * imager.slice_gain(np.interp(u, sorted_u, points[order, 2]))
+    transmitted = 1.0 - echo.shadow * imager.slice_gain(np.interp(u, sorted_u, points[order, 2]))
     v = imager.pixel_mm * np.arange(imager.rows)
     below = (v[:, None] > depth[None, :]) & under[None, :]
-    return np.where(below, kept[None, :], left)
+    return np.where(below, transmitted[None, :], left)

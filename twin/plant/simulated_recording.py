@@ -38,7 +38,7 @@ USUAL = PoseRanges()
 
 
 class SimulatedTruth(NamedTuple):
-    """What a calibration is to find."""
+    """Ground truth that a calibration estimates."""
 
     X: Floats  # T_end1_image, shape (4, 4), mm
     Y: Floats  # T_base1_base2, shape (4, 4), mm

@@ -117,9 +117,9 @@ class StereoWorkcell:
         ends = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
         rays = toward + ends
         lengths = np.linalg.norm(rays, axis=1)
-        found = crossings(self.head_c, camera.center_c, rays / lengths[:, None])
+        hits = crossings(self.head_c, camera.center_c, rays / lengths[:, None])
         nearest = np.full(len(rays), np.inf)
-        nearest[found.count > 0] = found.depth[found.first[found.count > 0]]
+        nearest[hits.count > 0] = hits.depth[hits.first[hits.count > 0]]
         return float(np.mean(nearest < lengths - radius_mm))
 
 
@@ -173,7 +173,7 @@ class StereoPlant(PlantArm):
         return np.asarray(self.ball.center_c + self._rng.normal(0.0, sigma, 3))
 
     def pointed_cp(self, marker: str) -> Floats:
-        """Where an operator points for a marker, shape (3,), mm, C."""
+        """Point that an operator marks for a marker, shape (3,), mm, C."""
         point = self.workcell.markers_c[self.workcell.case.markers.names.index(marker)]
         return np.asarray(point + self._operator.normal(0.0, POINTED_MM, 3))
 

@@ -61,7 +61,7 @@ PAUSE_S = 0.25
 
 
 class TrueContact(NamedTuple):
-    """What was true when a touch was read: how deep in the marker the tip was, and its speed."""
+    """Ground truth when a touch was read: depth of the tip in the marker, and its speed."""
 
     bias_mm: float
     speed_mm_s: float
@@ -124,8 +124,8 @@ class TouchingPlant:
         """By the position motors; the physics lets the needle pass the skin, so another checker looks after it."""
         done = self._run(Motors(), motion)
         seen = done.q[::LOOK_EVERY] + self._arrival
-        if in_air and (found := self._patient.first_contact(seen, needle_may_touch_patient=False)):
-            what = f"{found.contact.body} touched {found.contact.other}"
+        if in_air and (contact := self._patient.first_contact(seen, needle_may_touch_patient=False)):
+            what = f"{contact.contact.body} touched {contact.contact.other}"
             raise StoppedError(f"on the way {what}: the patient is not at the believed position")
         return _moved(done)
 

@@ -63,7 +63,7 @@ def jog_into_slice(
 
 
 class ShownNeedle(NamedTuple):
-    """What was true when an image was taken, and whether the arms touched each other."""
+    """Ground truth when an image was taken, and whether the arms touched each other."""
 
     needle: NeedleInImage
     touched: bool

@@ -51,7 +51,7 @@ ALLOWED = "a case with [errors] and markers: trials are drawn from them"
 
 
 class Stepwise(NamedTuple):
-    """What control scans on the way in gave and cost, a trial on average; their open loop has the same patients."""
+    """Gain and cost of control scans on the path in, mean of a trial; their open loop has the same patients."""
 
     steps: int
     passes: float  # corrections that were executed
@@ -65,8 +65,8 @@ class Stepwise(NamedTuple):
     def document(self) -> dict[str, Any]:
         """Plain values for JSON."""
         own = ("realised_rms_mm", "predicted_rms_mm", "coverage_95", "hit_share", "mean_p_hit", "touch_share")
-        said = self.open_loop.summary()
-        open_loop = {name: said[name] for name in own} | {"dose_msv": 0.0, "minutes": self.moving_s / 60.0}
+        stated = self.open_loop.summary()
+        open_loop = {name: stated[name] for name in own} | {"dose_msv": 0.0, "minutes": self.moving_s / 60.0}
         return {
             **{name: getattr(self, name) for name in ("steps", "passes", "scans", "dose_msv")},
             "minutes": (self.moving_s + self.seconds) / 60.0,
@@ -159,11 +159,11 @@ class Distribution:
         }
 
     def _guided(self) -> dict[str, Any]:
-        said = {"lost_sight": list(self.hidden), "assumed": list(self.assumed), "looks": dict(self.looks)}
+        stated = {"lost_sight": list(self.hidden), "assumed": list(self.assumed), "looks": dict(self.looks)}
         steps = {} if self.stepwise is None else self.stepwise.document()
         push = self.puncture.push
         pushed = {} if push is None else {"pushed_mm": float(push.at(np.array(push.target_mm)))}
-        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **pushed, **said, **steps}
+        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **pushed, **stated, **steps}
 
 
 def _fraction(trials: Bools) -> float | None:
@@ -199,11 +199,11 @@ def rehearse_trials(
     way, moving = _way(context, query, led, sight, steps)
     truths = draw_truths(query.puncture, query.truth, count, rng, moving)
     done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
-    found = replace(_measured(context, query, done.trials, rng, seed, way, done.stopped), assumed=assumed)
+    distribution = replace(_measured(context, query, done.trials, rng, seed, way, done.stopped), assumed=assumed)
     if steps is None:
-        return found
+        return distribution
     open_loop = rehearse_trials(context, outward_ct, q_insertion, count, seed, guidance, sight)
-    return replace(found, stepwise=_stepwise(case.control_scan, steps, done, open_loop))
+    return replace(distribution, stepwise=_stepwise(case.control_scan, steps, done, open_loop))
 
 
 def _stepwise(scan: ControlScanSection | None, steps: int, done: GuidedTrials, open_loop: Distribution) -> Stepwise:
@@ -321,11 +321,11 @@ def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel,
     if way is None:
         return touch(model)
     follows = [followers(context.case, context.anatomy)[column] for column in model.columns]
-    found = np.zeros(len(follows))
+    chosen = np.zeros(len(follows))
     for one in set(follows):
         chances = np.mean([touch(of) for of in at_phases(way.model, way.name, model, one)], axis=0)
-        found = np.where([its == one for its in follows], chances, found)
-    return found
+        chosen = np.where([its == one for its in follows], chances, chosen)
+    return chosen
 
 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
@@ -342,7 +342,7 @@ def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floa
 
 
 def _hits(context: CaseContext, trials: Trials, off_mm: Floats) -> Bools:
-    """Which trials hit: within the radius of the true target, or in the mesh of the target's own scan."""
+    """Trials that hit: within the radius of the true target, or in the mesh of the target's own scan."""
     case = context.case
     if case.hit_radius_mm is not None:
         return np.asarray(np.linalg.norm(trials.tip_ct - trials.target_ct, axis=1) < case.hit_radius_mm)

@@ -76,15 +76,17 @@ def guided_trials(
     drift = _drift(errors, truths.arrival, rng)
     moved, aside, moves = np.zeros((count, 3)), np.zeros((count, 3)), list[Floats]()
     stopped, reached = np.zeros(count, bool), np.ones(count, bool)
-    found: Readings = {("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)}
+    readings: Readings = {
+        ("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)
+    }
     for number, look in enumerate(model.looks):
         q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
         arrival = rng.normal(size=(count, 6)) * errors.arm.arriving
         needle = true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
-        found |= devices.look(look, number, q, needle)
+        readings |= devices.look(look, number, q, needle)
         reached &= there
         if (known := model.guided(way.name, number)) is not None:
-            z = np.hstack([found[one.name, one.look] for one in model.readings if one.look <= number])
+            z = np.hstack([readings[one.name, one.look] for one in model.readings if one.look <= number])
             z = (z.reshape(count, -1, 3) @ turned).reshape(count, -1)
             rows = known.gain[:3, : z.shape[1]], known.aside[:, : z.shape[1]]
             wanted, off = (np.einsum("nab,nb->na", turned, z @ some.T) for some in rows)
@@ -98,7 +100,7 @@ def guided_trials(
 
 
 def _drift(errors: ErrorModel, last: Floats, rng: np.random.Generator) -> Floats:
-    """What drifted since the touches, given drift and last arrival together, shape (n, 6), rad."""
+    """Drift of the joints since the touches, given drift and last arrival together, shape (n, 6), rad."""
     drift, anew = errors.arm.drift, errors.arm.arriving
     whole = np.hypot(drift, anew)
     if whole == 0.0:
@@ -130,19 +132,19 @@ class _Devices:
         return cls(puncture, truths, model, T_base_ct, cameras, probe, scanner)
 
     def look(self, look: Look, number: int, q: Floats, needle: TrueNeedle) -> Readings:
-        """What the devices read of the straight needles that are really there, less what is expected of q (n, 6)."""
+        """Readings of the true straight needles by the devices, less those expected of q (n, 6)."""
         puncture, truths = self.puncture, self.truths
         nominal = flange_pose(puncture.model, q)
         axis = nominal[:, :3, 2]
         tip = nominal[:, :3, 3] + puncture.tip_mm * axis
-        found = self._by_cameras(look, needle, tip, axis)
+        readings = self._by_cameras(look, needle, tip, axis)
         if puncture.bend is not None:
             grown = max(look.inserted, 0.0) ** 2
             needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), truths.side)
         moved = truths.motion_ct + truths.breath_ct + pushed_by(puncture, truths, needle)
         target_ct = truths.target_ct + moved
-        found |= self._by_probe(needle, tip, target_ct) | self._by_scanner(needle, tip, target_ct)
-        return {(name, number): value for name, value in found.items() if name not in look.hidden}
+        readings |= self._by_probe(needle, tip, target_ct) | self._by_scanner(needle, tip, target_ct)
+        return {(name, number): value for name, value in readings.items() if name not in look.hidden}
 
     def _by_cameras(self, look: Look, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
         if self.cameras is None or CAMERAS in look.hidden:
@@ -174,8 +176,8 @@ class _Devices:
             return {}
         R, t = self.T_base_ct[:, :3, :3], self.T_base_ct[:, :3, 3]
         there = self.scanner.tip(needle.tip_base)
-        found = {SCANNED_TIP: np.einsum("nab,nb->na", R, there) + t - tip}
+        readings = {SCANNED_TIP: np.einsum("nab,nb->na", R, there) + t - tip}
         if self.model.scan is not None and self.model.scan.target_seen:
             target = self.scanner.target(target_ct)
-            found[SCANNED_TARGET] = np.einsum("nab,nb->na", R, target - self.puncture.target_ct)
-        return found
+            readings[SCANNED_TARGET] = np.einsum("nab,nb->na", R, target - self.puncture.target_ct)
+        return readings

@@ -53,8 +53,8 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
     if case.errors is None or case.registration is None or case.rehearsal.truth_base is not None:
         return bent_truth(context, plan, draw_truth(case, plan.T_base_ct, seed=seed))
     seed = case.rehearsal.seed if seed is None else seed
-    found = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
-    return _of_drawn(found, 0, f"drawn with seed {seed} from {_declared(found)}")
+    distribution = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
+    return _of_drawn(distribution, 0, f"drawn with seed {seed} from {_declared(distribution)}")
 
 
 def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
@@ -71,40 +71,45 @@ def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
     return replace(truth, T_base_ct_true=moved, bevel_side=side, source=source)
 
 
-def median_truth(found: Distribution) -> Truth:
+def median_truth(distribution: Distribution) -> Truth:
     """The truth of the median trial by tip error; errors as of `plan_truth`."""
-    count = len(found) + found.unreached + found.stopped
-    row = int(spread_rows(found, 1)[0]) if len(found) else 0
-    return _of_drawn(found, row, f"the median of {plural(count, 'trial')}, seed {found.seed}, from {_declared(found)}")
+    count = len(distribution) + distribution.unreached + distribution.stopped
+    row = int(spread_rows(distribution, 1)[0]) if len(distribution) else 0
+    return _of_drawn(
+        distribution,
+        row,
+        f"the median of {plural(count, 'trial')}, seed {distribution.seed}, from {_declared(distribution)}",
+    )
 
 
-def spread_rows(found: Distribution, count: int) -> Ints:
+def spread_rows(distribution: Distribution, count: int) -> Ints:
     """Trials spread evenly over the order of their tip errors, shape (count,) at most; the median where it is one."""
-    order = np.argsort(found.tip_error_mm, kind="stable")
+    order = np.argsort(distribution.tip_error_mm, kind="stable")
     places = ((np.arange(count) + 0.5) / count * len(order) - 0.5).round(9)
     return np.asarray(np.unique(order[np.floor(places).clip(0).astype(np.int64)]))
 
 
-def _of_drawn(found: Distribution, row: int, source: str) -> Truth:
-    if len(found) == 0:
-        what = f"the needle reached the target in none of {found.unreached + found.stopped} trials"
-        why = f"{found.unreached} beyond the arm's reach, {found.stopped} stopped before a correction left the corridor"
+def _of_drawn(distribution: Distribution, row: int, source: str) -> Truth:
+    if len(distribution) == 0:
+        what = f"the needle reached the target in none of {distribution.unreached + distribution.stopped} trials"
+        stopped = f"{distribution.stopped} stopped before a correction left the corridor"
+        why = f"{distribution.unreached} beyond the arm's reach, {stopped}"
         raise NoAnswerError(f"{what}: {why}", code="out_of_reach")
-    return drawn_truth(found.puncture, found.trials, row, found.seed, source)
+    return drawn_truth(distribution.puncture, distribution.trials, row, distribution.seed, source)
 
 
-def _declared(found: Distribution) -> str:
-    return "[rehearsal.errors], not from the believed errors" if found.wrong_belief else "[errors]"
+def _declared(distribution: Distribution) -> str:
+    return "[rehearsal.errors], not from the believed errors" if distribution.wrong_belief else "[errors]"
 
 
 def error_rank(
-    context: CaseContext, q_insertion: Floats, found: Distribution | None, tip_error_mm: float
+    context: CaseContext, q_insertion: Floats, distribution: Distribution | None, tip_error_mm: float
 ) -> ErrorRank | None:
     """Rank of a tip error among trials, or without them in the prediction; None without declared errors."""
-    if found is not None:
-        errors = found.tip_error_mm
+    if distribution is not None:
+        errors = distribution.tip_error_mm
         below = np.mean(errors < tip_error_mm) + np.mean(errors <= tip_error_mm)
-        return ErrorRank(float(50 * below), len(found) + found.unreached)
+        return ErrorRank(float(50 * below), len(distribution) + distribution.unreached)
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(context.case, registration)
     if error is None:
@@ -127,15 +132,15 @@ def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_tar
 
 
 def physics_trials(
-    context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count
+    context: CaseContext, plan: Plan, distribution: Distribution, count: int, progress: Count
 ) -> dict[str, Any]:
     """Some trials, spread over the order of tip errors, in the simulator: how far tips ended from the kinematics'."""
-    rows = spread_rows(found, count)
+    rows = spread_rows(distribution, count)
     apart, contacts = np.empty(len(rows)), 0
     for number, row in enumerate(rows.tolist()):
-        truth = drawn_truth(found.puncture, found.trials, row, found.seed, "a room")
+        truth = drawn_truth(distribution.puncture, distribution.trials, row, distribution.seed, "a room")
         done = rehearse(plan, context.case, context.anatomy, truth)
-        apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.trials.tip_ct[row])
+        apart[number] = np.linalg.norm(done.tip_true_ct[-1] - distribution.trials.tip_ct[row])
         contacts += bool(done.contacts)
         progress(number + 1, len(rows))
     return {

@@ -168,8 +168,8 @@ def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueT
     into_base = T_base_flange[:3, 2]
     end_ct = apply(T_ct_base, T_base_flange[:3, 3] + plan.needle_length_mm * into_base)
     outward_ct = -T_ct_base[:3, :3] @ into_base
-    found = skin_paths(anatomy.skin, end_ct, outward_ct[None], plan.needle_length_mm)
-    length = float(found.path_length[0])
+    paths = skin_paths(anatomy.skin, end_ct, outward_ct[None], plan.needle_length_mm)
+    length = float(paths.path_length[0])
     if not np.isfinite(length):
         return None
     entry_base = apply(truth.T_base_ct_true, end_ct + length * outward_ct)

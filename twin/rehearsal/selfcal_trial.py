@@ -162,23 +162,23 @@ def run_trial(
 
 def trial_summary(trial: SelfcalTrial) -> dict[str, Any]:
     """One seed as plain values, mm and degrees."""
-    found, truth, errors = trial.calibration, trial.truth, trial.detection_errors()
-    a, b = found.needle_direction_end2, truth.V
+    calibration, truth, errors = trial.calibration, trial.truth, trial.detection_errors()
+    a, b = calibration.needle_direction_end2, truth.V
     angle = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
     return {
         "seed": trial.seed,
-        "residual_rms_mm": found.rms_mm,
-        "predicted_tre_mm": predicted_tre(found, trial.acquisition.recording),
+        "residual_rms_mm": calibration.rms_mm,
+        "predicted_tre_mm": predicted_tre(calibration, trial.acquisition.recording),
         "held_out_error_rms_mm": rms(trial.unseen_mm),
-        "X_error_mm": float(np.linalg.norm(found.X[:3, 3] - truth.X[:3, 3])),
-        "Y_error_mm": float(np.linalg.norm(found.Y[:3, 3] - truth.Y[:3, 3])),
-        "tip_error_mm": float(np.linalg.norm(found.tip_end2 - truth.tip_end2)),
+        "X_error_mm": float(np.linalg.norm(calibration.X[:3, 3] - truth.X[:3, 3])),
+        "Y_error_mm": float(np.linalg.norm(calibration.Y[:3, 3] - truth.Y[:3, 3])),
+        "tip_error_mm": float(np.linalg.norm(calibration.tip_end2 - truth.tip_end2)),
         "needle_direction_error_deg": float(np.degrees(angle)),
         "detected_tip_along_mm": [float(np.mean(errors[:, 0])), float(np.std(errors[:, 0]))],
         "detected_tip_across_mm": [float(np.mean(errors[:, 1])), float(np.std(errors[:, 1]))],
         "detected_angle_deg": np.degrees([np.mean(errors[:, 2]), np.std(errors[:, 2])]).tolist(),
         "missed": trial.acquisition.missed,
-        "set_aside": list(found.outliers),
+        "set_aside": list(calibration.outliers),
         "true_contacts": sum(one.touched for one in trial.shown),
         "punctures": puncture_summary(trial.punctures),
     }

@@ -131,7 +131,7 @@ class ServoTrial(NamedTuple):
 
 
 class Reached(NamedTuple):
-    """What a picture shows of one target: true joints (6,), rad, at each of the servo's visits, and at the end."""
+    """True joints (6,), rad, at each of the servo's visits to one target, and at the end, for a picture."""
 
     row: TargetRow
     servoed: Servoed
@@ -189,8 +189,8 @@ def run_session(
         recorder.finish((case.markers.names, case.targets.names), reading)
     declaration = None
     with suppress(NoAnswerError):
-        found = guide.adjusted()
-        declaration = DeclarationTest(found.chi2, found.freedom)
+        adjusted = guide.adjusted()
+        declaration = DeclarationTest(adjusted.chi2, adjusted.freedom)
     rows, residual = tuple(one.row for one in reached), float(np.mean(calibration.robot_residual_mm))
     stereo = tuple(stereo_mm.tolist())
     figures = ServoTrial(seed, stereo, calibration.rms_px, mapping.fre_mm, residual, rows, None, declaration)
@@ -256,11 +256,11 @@ def run_trial(case: ServoCase, seed: int, empty: CellChecker | None = None) -> S
 
 def run_trials(case: ServoCase, seeds: Sequence[int], done: Count = uncounted) -> list[ServoTrial]:
     """The trials of every seed, in the order given; they share the checker of the empty workcell."""
-    empty, found = workcell_checker(case, None), []
+    empty, trials = workcell_checker(case, None), []
     for seed in seeds:
-        found.append(run_trial(case, seed, empty))
-        done(len(found), len(seeds))
-    return found
+        trials.append(run_trial(case, seed, empty))
+        done(len(trials), len(seeds))
+    return trials
 
 
 def declaration_test(trials: Sequence[ServoTrial]) -> DeclarationTest | None:
@@ -280,7 +280,7 @@ def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
     stereo = np.concatenate([one.stereo_mm for one in trials])
     mapping, expected, before, after, only = np.array([row[2:7] for row in rows]).T
     calibrated = [row.calibrated_mm for row in rows if row.calibrated_mm is not None]
-    found = {
+    errors = {
         "seeds": len(trials),
         "targets": len(rows),
         "refused": sum(bool(one.refused) for one in trials),  # seeds whose session failed
@@ -298,7 +298,7 @@ def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
         "not_confirmed": np.mean([row.stop != ServoStop.CONVERGED for row in rows]),
         "after_over_mapping": after.mean() / mapping.mean(),  # 1 is the floor
     }
-    return {key: value if isinstance(value, int | None) else float(value) for key, value in found.items()}
+    return {key: value if isinstance(value, int | None) else float(value) for key, value in errors.items()}
 
 
 def needle_statistics(outcomes: Sequence[NeedleOutcome | None]) -> dict[str, Any] | None:

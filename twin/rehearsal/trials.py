@@ -75,7 +75,7 @@ class Trials(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """What moves between scan and insertion: target and surroundings (3, 3), mm^2; markers by so much of its breath."""
+    """Motion between scan and insertion: target and surroundings (3, 3), mm^2; markers by a fraction of its breath."""
 
     cov_ct: Floats  # shape (3, 3), mm^2, of the target and its surroundings
     breathing: Breathing | None

@@ -41,8 +41,8 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     what = "it states no mass and inertia above 0, without which nothing can be simulated"
     for members in urdf.chain.bodies[1:]:
         if not any(member.link.weighs for member in members):
-            here = f"{urdf.where}: link '{members[0].link.name}'"
-            refuse(what, here, "an <inertial> of every moving link", "no_inertia")
+            where = f"{urdf.where}: link '{members[0].link.name}'"
+            refuse(what, where, "an <inertial> of every moving link", "no_inertia")
     _simplify(robot)
     _replace_shapes(robot, model, folder)
     holder_mm = tool.holder_length_mm

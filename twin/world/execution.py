@@ -59,8 +59,8 @@ class Recorder:
     def execution(self) -> Execution:
         """The records so far."""
         times = np.array([self._time(row) for row in self._rows])
-        found = np.array(self._q), np.array(self._poses), tuple(self._touches), self._max_speed
-        return Execution(times, self._q_command[self._rows], *found)
+        records = np.array(self._q), np.array(self._poses), tuple(self._touches), self._max_speed
+        return Execution(times, self._q_command[self._rows], *records)
 
     def _time(self, row: int) -> float:
         return self._start_s + row * self._dt
@@ -98,8 +98,8 @@ def touches(workcell: SimulatedWorkcell, time_s: float = 0.0) -> tuple[ContactEv
         other, link, distance_m = point[2], point[3], point[8]
         if distance_m <= 0 and other in workcell.bodies:
             deepest[link, other] = max(deepest.get((link, other), 0.0), -float(to_mm(distance_m)))
-    found = sorted(deepest.items())
-    return tuple(ContactEvent(time_s, arm.link_name(link), workcell.bodies[other], mm) for (link, other), mm in found)
+    touches = sorted(deepest.items())
+    return tuple(ContactEvent(time_s, arm.link_name(link), workcell.bodies[other], mm) for (link, other), mm in touches)
 
 
 def contact_force(arm: Arm, link: str) -> Floats:

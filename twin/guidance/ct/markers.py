@@ -63,15 +63,15 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
     middles = np.array([piece.middle_ct for piece in pieces]).reshape(-1, 3)
     distance = np.linalg.norm(expected.points[:, None] - middles, axis=2)
     rows, columns = linear_sum_assignment(np.where(distance < FARTHEST_MM, distance, 1e6))
-    found = {int(row): int(column) for row, column in zip(rows, columns, strict=True)}
+    pairs = {int(row): int(column) for row, column in zip(rows, columns, strict=True)}
     for row, name in enumerate(expected.names):
-        if row not in found or distance[row, found[row]] >= FARTHEST_MM:
+        if row not in pairs or distance[row, pairs[row]] >= FARTHEST_MM:
             voxels = " x ".join(f"{size:g}" for size in spacing_mm(volume))
             near = f"metal within {FARTHEST_MM:g} mm of the expected position"
             allowed = f"{near}, and voxels far smaller than the marker"
             what = f"marker {name} is not seen in the image (voxels of {voxels} mm)"
             refuse(what, volume.path, allowed, "marker_not_seen")
-    return [pieces[found[row]] for row in range(len(expected.names))]
+    return [pieces[pairs[row]] for row in range(len(expected.names))]
 
 
 def _by_rule(weights: Floats, piece: Metal, volume: Volume) -> Floats:
@@ -91,13 +91,13 @@ RIM_MM = 4.0
 
 def read_lesion(volume: Volume, mask: NDArray[np.bool_]) -> Floats:
     """The middle of what a mask of the CT outlines, by the values in and around it, shape (3,), LPS mm."""
-    found = ndimage.find_objects(mask.astype(np.uint8))
-    if not found:
+    boxes = ndimage.find_objects(mask.astype(np.uint8))
+    if not boxes:
         refuse("no voxel belongs to the lesion", volume.path, "a lesion larger than a voxel", "lesion_not_seen")
     spacing = spacing_mm(volume)
     around = np.ceil(RIM_MM / spacing).astype(int) + 1
-    low = np.maximum(np.array([one.start for one in found[0]]) - around, 0)
-    high = np.minimum(np.array([one.stop for one in found[0]]) + around, mask.shape)
+    low = np.maximum(np.array([one.start for one in boxes[0]]) - around, 0)
+    high = np.minimum(np.array([one.stop for one in boxes[0]]) + around, mask.shape)
     box = (slice(low[0], high[0]), slice(low[1], high[1]), slice(low[2], high[2]))
     values, inside = volume.values[box].astype(np.float64), mask[box]
     distance = ndimage.distance_transform_edt(~inside, spacing)

@@ -83,10 +83,10 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
     refused.
     """
     if diameter_mm is not None:
-        found = [one for one in _needles(volume, target_ct, diameter_mm, None) if not one[0].unclear]
-        if not found:
+        needles = [one for one in _needles(volume, target_ct, diameter_mm, None) if not one[0].unclear]
+        if not needles:
             _refuse_none(volume, _dilution(volume, diameter_mm))
-        nearest = min(found, key=lambda one: float(np.linalg.norm(one[0].path_ct - target_ct, axis=1).min()))
+        nearest = min(needles, key=lambda one: float(np.linalg.norm(one[0].path_ct - target_ct, axis=1).min()))
         _check_tip(volume, *nearest, target_ct)
         return nearest[0]
     rods = [piece for piece in metal_pieces(volume) if piece.size_mm >= SHORTEST_MM]
@@ -115,20 +115,20 @@ def read_needle(
         InputError: No needle, two of which none is plainly the plan's, a tip outside of the image, at other metal, or
             lost in streaks.
     """
-    found = list(_needles(volume, target_ct, diameter_mm, inside, markers))
-    if not found:
+    needles = list(_needles(volume, target_ct, diameter_mm, inside, markers))
+    if not needles:
         _refuse_none(volume, f", that enters the body{_dilution(volume, diameter_mm)}")
     findings: list[Finding] = []
-    needle, hidden = found[0]
-    if len(found) > 1:
-        (needle, hidden), findings = _chosen(volume, found, planned)
+    needle, hidden = needles[0]
+    if len(needles) > 1:
+        (needle, hidden), findings = _chosen(volume, needles, planned)
     elif not _of_plan(needle, *(planned or (target_ct, needle.forward_ct))):
-        said = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
-        said = f"the needle's line passes the target by more than {OF_PLAN_MM:g} mm" if planned is None else said
-        findings = [Finding("far_from_plan", Severity.WARNING, f"{said}: is it the needle?")]
+        warning = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
+        warning = f"the needle's line passes the target by more than {OF_PLAN_MM:g} mm" if planned is None else warning
+        findings = [Finding("far_from_plan", Severity.WARNING, f"{warning}: is it the needle?")]
     if not needle.unclear and not _enters(volume, needle, inside):
-        said = "the needle is in the body as far as it is seen: that it comes through the skin is not; is it a lead?"
-        findings.append(Finding("entry_not_seen", Severity.WARNING, said))
+        warning = "the needle is in the body as far as it is seen: that it comes through the skin is not; is it a lead?"
+        findings.append(Finding("entry_not_seen", Severity.WARNING, warning))
     if needle.leaves:
         what = "the needle leaves the image; its tip is outside"
         refuse(what, volume.path, "a scan with its tip", "tip_outside_image")
@@ -147,8 +147,8 @@ def read_needle(
     thick = float(spacing_mm(volume)[2])
     if thick > THICK_MM + 0.01:
         near = f"within {BESIDE_MM:g} mm of this one"
-        said = f"slices of {thick:g} mm: a second needle {near} may not be seen; look for it"
-        findings.append(Finding("thick_slices", Severity.WARNING, said, {"slice_mm": thick}))
+        warning = f"slices of {thick:g} mm: a second needle {near} may not be seen; look for it"
+        findings.append(Finding("thick_slices", Severity.WARNING, warning, {"slice_mm": thick}))
     return needle, tuple(findings)
 
 
@@ -167,15 +167,15 @@ def _dilution(volume: Volume, diameter_mm: float) -> str:
 
 
 def _chosen(
-    volume: Volume, found: Sequence[tuple[FoundNeedle, Bools]], planned: tuple[Floats, Floats] | None
+    volume: Volume, needles: Sequence[tuple[FoundNeedle, Bools]], planned: tuple[Floats, Floats] | None
 ) -> tuple[tuple[FoundNeedle, Bools], list[Finding]]:
-    alike = [] if planned is None else [one for one in found if _of_plan(one[0], *planned)]
-    tips = "; ".join("({:.0f}, {:.0f}, {:.0f})".format(*one[0].tip_ct) for one in found)
-    said = f"{len(found)} needles enter the body, with tips at {tips} mm in the scan"
+    alike = [] if planned is None else [one for one in needles if _of_plan(one[0], *planned)]
+    tips = "; ".join("({:.0f}, {:.0f}, {:.0f})".format(*one[0].tip_ct) for one in needles)
+    text = f"{len(needles)} needles enter the body, with tips at {tips} mm in the scan"
     if len(alike) != 1:
-        refuse(said, volume.path, "one needle, or --plan whose line is near to only one", "two_needles")
-    said += "; the one near the planned line is read: ({:.0f}, {:.0f}, {:.0f})".format(*alike[0][0].tip_ct)
-    return alike[0], [Finding("two_needles", Severity.WARNING, said, {"needles": len(found)})]
+        refuse(text, volume.path, "one needle, or --plan whose line is near to only one", "two_needles")
+    text += "; the one near the planned line is read: ({:.0f}, {:.0f}, {:.0f})".format(*alike[0][0].tip_ct)
+    return alike[0], [Finding("two_needles", Severity.WARNING, text, {"needles": len(needles)})]
 
 
 def _of_plan(needle: FoundNeedle, tip_ct: Floats, forward_ct: Floats) -> bool:
@@ -200,10 +200,10 @@ def _needles(
             if short or any(_same(volume, one, _places(volume, metal)) for one in known):
                 continue
             for part, beside_it in _parts(volume, metal, level, hidden, diameter_mm):
-                found = _needle(volume, part, level, target_ct, inside, beside_it, diameter_mm)
-                if found is not None and not any(_same(volume, one, found.path_ct) for one in known):
-                    known.append(found)
-                    yield found, beside_it
+                needle = _needle(volume, part, level, target_ct, inside, beside_it, diameter_mm)
+                if needle is not None and not any(_same(volume, one, needle.path_ct) for one in known):
+                    known.append(needle)
+                    yield needle, beside_it
 
 
 def _length(volume: Volume, metal: Metal, level: float, hidden: Bools, diameter_mm: float) -> float:
@@ -230,22 +230,22 @@ def _needle(
     volume: Volume, part: Metal, level: float, target_ct: Floats, inside: Inside | None, hidden: Bools,
     diameter_mm: float,
 ) -> FoundNeedle | None:  # fmt: skip
-    """What a long piece of metal is: a needle, one that is unclear, or nothing that enters the body."""
+    """The needle that a long piece of metal is, clear or unclear; None where it does not enter the body."""
     line, thin = _axis(volume, part), _thin(volume, part, diameter_mm)
     if thin:
         part, line = _whole(volume, part, line, hidden)
     ends = _tip_end(volume, part, line, target_ct, inside, hidden)
     if ends is None:
         return None
-    found = fit_needle(volume, part, toward(line, ends[0]), diameter_mm, hidden) if thin else None
-    if found is None and level == METAL_HU:  # never passed over in silence
-        found = unclear(line, ends[0])
-    if found is None or not ends[1]:
-        return found
+    needle = fit_needle(volume, part, toward(line, ends[0]), diameter_mm, hidden) if thin else None
+    if needle is None and level == METAL_HU:  # never passed over in silence
+        needle = unclear(line, ends[0])
+    if needle is None or not ends[1]:
+        return needle
     # one at the border may end between the voxels, however its reading errs along it
-    sd = float(np.sqrt(found.forward_ct @ found.cov_ct[:3, :3] @ found.forward_ct))
-    farthest = found.tip_ct + 3.0 * sd * found.forward_ct
-    return found._replace(leaves=not _in_image(volume, farthest[None])[0])
+    sd = float(np.sqrt(needle.forward_ct @ needle.cov_ct[:3, :3] @ needle.forward_ct))
+    farthest = needle.tip_ct + 3.0 * sd * needle.forward_ct
+    return needle._replace(leaves=not _in_image(volume, farthest[None])[0])
 
 
 def _thin(volume: Volume, metal: Metal, diameter_mm: float) -> bool:
@@ -379,13 +379,13 @@ def _tip_end(
     return None
 
 
-def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Floats) -> None:
-    beyond = found.tip_ct + np.arange(-SEEN_MM, SEEN_MM + 0.1, 0.25)[:, None] * found.forward_ct
+def _check_tip(volume: Volume, needle: FoundNeedle, hidden: Bools, target_ct: Floats) -> None:
+    beyond = needle.tip_ct + np.arange(-SEEN_MM, SEEN_MM + 0.1, 0.25)[:, None] * needle.forward_ct
     at = np.rint(apply(np.linalg.inv(volume.T_ct_index), beyond)).astype(int)
     inside = ((at >= 0) & (at < hidden.shape)).all(axis=1)
     if not hidden[tuple(at[inside].T)].any():
         return
-    lateral = needle_error(found.tip_ct, found.forward_ct, target_ct).lateral_mm
+    lateral = needle_error(needle.tip_ct, needle.forward_ct, target_ct).lateral_mm
     what = f"other metal hides the needle's tip; the needle's axis passes the target by {lateral:.1f} mm"
     refuse(what, volume.path, f"a tip at least {SEEN_MM:g} mm away from wider metal and its blur", "tip_hidden")
 
@@ -457,8 +457,8 @@ def _tip(volume: Volume, metal: Metal, line: Line) -> Floats:
     def misfit(tip: float) -> float:
         return float(np.sum((np.minimum(ndtr((tip - along[near]) / blur), full) - seen) ** 2))
 
-    found = minimize_scalar(misfit, bounds=(end - SHAFT_MM / 2, end + SHAFT_MM / 2), method="bounded")
-    return line.middle + float(found.x) * line.forward
+    minimum = minimize_scalar(misfit, bounds=(end - SHAFT_MM / 2, end + SHAFT_MM / 2), method="bounded")
+    return line.middle + float(minimum.x) * line.forward
 
 
 class NeedleError(NamedTuple):

@@ -149,7 +149,7 @@ class _Seen(NamedTuple):
 
     @property
     def bright(self) -> Bools:
-        """Which of them a needle would make bright, shape (n,): bone is far below."""
+        """Voxels that a needle would make bright, shape (n,): bone is far below."""
         image = self.curve.parts(np.zeros(NUMBERS), self.local)
         return np.asarray(image > LEAST_METAL * image.max(initial=0.0))
 
@@ -159,18 +159,18 @@ class _Seen(NamedTuple):
         return bool(self.length * abs(self.thick[0]) < FEW_SLICES * (self.thick @ self.thick))
 
     def left(self, x: Floats) -> Floats:
-        """What the image of a curve's numbers leaves of them, shape (n,)."""
+        """Residuals of the image of a curve's numbers, shape (n,)."""
         return self.curve.parts(x, self.local) - self.parts
 
     @property
     def pieces(self) -> Ints:
-        """Which piece of a slice each belongs to, shape (n,): what a slice errs is shared along `SHARED_MM`."""
+        """Number of the piece of a slice of each, shape (n,): the error of a slice is shared along `SHARED_MM`."""
         along = np.floor(self.local[:, 0] / SHARED_MM).astype(np.int64)
         return np.unique(np.stack([self.slices, along]), axis=1, return_inverse=True)[1].ravel()
 
 
 class _Around(NamedTuple):
-    """What surrounds a piece of metal: places (n, 3), slices (n,), parts of metal (n,), and which no other hides."""
+    """Surroundings of a piece of metal: places (n, 3), slices (n,), parts of metal (n,), and which no other hides."""
 
     places: Floats
     slices: Ints
@@ -202,7 +202,7 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
     if not len(heavy):
         return None
     along = heavy @ line.forward
-    start, begun = line.middle + float(along.max()) * line.forward, np.zeros(7)
+    start, start_values = line.middle + float(along.max()) * line.forward, np.zeros(7)
     length = min(FITTED_MM, float(np.ptp(along)) - TAIL_MM)
     for again in range(STRAIGHTENED):
         seen = around.about(volume, line, start, length, diameter_mm)
@@ -211,12 +211,12 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
         usual = float(seen.curve.parts(np.zeros(NUMBERS), seen.local)[seen.bright].mean())
         if around.typical < GAINS[0] / 2 * usual:
             return None
-        straight = _straight(seen, begun)
+        straight = _straight(seen, start_values)
         if again + 1 < STRAIGHTENED:  # once more about the line that was found
             start = start + straight.x[1:3] @ seen.axes[1:]  # not along it, where a bent needle leaves a straight rod
             forward = np.concatenate([[1.0], straight.x[3:5]]) @ seen.axes
             line = line._replace(forward=forward / np.linalg.norm(forward))
-            begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
+            start_values = straight.x * [1, 0, 0, 0, 0, 1, 1]
             length = min(length, _slim(seen, np.concatenate([straight.x, np.zeros(4)])))
     weighed = _weighed(seen, straight) if straight.jac.any() else None  # no slope: its image has left the metal
     if weighed is None or not _alike(seen, weighed[0], full_part(volume)):
@@ -235,7 +235,7 @@ def _alike(seen: _Seen, x: Floats, full: float) -> bool:
 
 
 def _unlike(seen: _Seen, x: Floats) -> float:
-    """What numbers (11,) leave of the squares: of all voxels, or about the tip, of a place behind it; the larger."""
+    """Fraction of squares that numbers (11,) leave: of all voxels, or about the tip, of a place behind; the larger."""
     place = np.floor((seen.local[:, 0] - x[0]) / PLACE_MM).astype(int)
     tip = max(-place.min() - TIP_PLACES, 1)
     squares = ((one**2).astype(np.float64) for one in (seen.left(x), seen.curve.parts(x, seen.local)))
@@ -295,9 +295,9 @@ def _about(local: Floats, seen: Floats, length: float, thick: Floats, width_mm: 
     return about, np.asarray(bends, dtype=np.float64)
 
 
-def _straight(seen: _Seen, begun: Floats) -> OptimizeResult:
+def _straight(seen: _Seen, start: Floats) -> OptimizeResult:
     """The straight rod nearest to what is seen; of one in few slices the best of those that begin elsewhere in them."""
-    fit = _settled(seen, begun)
+    fit = _settled(seen, start)
     if not seen.few:
         return fit
     moves = _moves(seen)
@@ -331,9 +331,9 @@ def _unsettled(seen: _Seen, x: Floats, noise: float) -> tuple[Floats, Floats]:
     return mean, np.asarray((moves - mean).T @ (odds[:, None] * (moves - mean)))
 
 
-def _settled(seen: _Seen, begun: Floats, weights: Floats | float = 1.0, noise: float = 0.0) -> OptimizeResult:
+def _settled(seen: _Seen, start: Floats, weights: Floats | float = 1.0, noise: float = 0.0) -> OptimizeResult:
     """The numbers from a start (7,) or (11,) that bring the image nearest to what is seen."""
-    count, weights = len(begun), np.broadcast_to(weights, len(seen.parts))
+    count, weights = len(start), np.broadcast_to(weights, len(seen.parts))
     # of 11 the bends are held to `BEND_SD`, which weighs as much as a voxel of so much noise
     held = noise * np.eye(NUMBERS)[7:count] / BEND_SD[: count - 7, None]
 
@@ -346,7 +346,7 @@ def _settled(seen: _Seen, begun: Floats, weights: Floats | float = 1.0, noise: f
     def slopes(x: Floats) -> Floats:
         return np.concatenate([weights[:, None] * seen.curve.slopes(whole(x), seen.local), held])[:, :count]
 
-    return least_squares(misfit, begun, slopes, x_scale=SCALES[:count], method="lm", max_nfev=MOST_CALLS,
+    return least_squares(misfit, start, slopes, x_scale=SCALES[:count], method="lm", max_nfev=MOST_CALLS,
                          ftol=SETTLED, xtol=SETTLED)  # fmt: skip
 
 

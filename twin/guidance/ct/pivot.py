@@ -97,15 +97,15 @@ def pivot_calibration(
     if not factors[-1] * WORST_FACTOR > 1.0:
         allowed = "tilts of 20 degrees or more to several sides"
         refuse("the poses rotate too little against each other to find the tip", where, allowed, "poses_too_alike")
-    found, *_ = np.linalg.lstsq(A, -T_base_flange[:, :3, 3].reshape(-1), rcond=None)
-    left = (A @ found + T_base_flange[:, :3, 3].reshape(-1)).reshape(-1, 3)
+    solution, *_ = np.linalg.lstsq(A, -T_base_flange[:, :3, 3].reshape(-1), rcond=None)
+    left = (A @ solution + T_base_flange[:, :3, 3].reshape(-1)).reshape(-1, 3)
     whole = noise_mm**2 * np.eye(3 * count) + (0.0 if arm_cov is None else arm_cov)
     back = np.linalg.pinv(A)
     off = np.eye(3 * count) - A @ back
     expected = noise_mm * float(np.sqrt((3 * count - 6) / count))
     expected_whole = float(np.sqrt(np.trace(off @ whole @ off) / count))
     cov = (back @ whole @ back.T)[:3, :3]
-    return Pivot(found[:3], found[3:], cov, np.linalg.norm(left, axis=1), expected, expected_whole)
+    return Pivot(solution[:3], solution[3:], cov, np.linalg.norm(left, axis=1), expected, expected_whole)
 
 
 def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats) -> Floats:
@@ -114,7 +114,7 @@ def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats)
     variances = noise.eta_variances.copy()
     variances[PARAMETERS["tip_offset"]] = variances[PARAMETERS["needle_direction"]] = 0.0
     anew = noise.cov_base - errors.touch_mm**2 * np.eye(3)
-    found = (noise.arm_jacobian * variances) @ noise.arm_jacobian.T
+    covariance = (noise.arm_jacobian * variances) @ noise.arm_jacobian.T
     for row, block in enumerate(anew):
-        found[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] += block
-    return np.asarray(found)
+        covariance[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] += block
+    return np.asarray(covariance)

@@ -85,7 +85,7 @@ target: some have moved, on the skin or with it, and the body ties the frames in
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What a case knows of a patient and a scan shows again, LPS mm: points on skin and bones, and on other organs."""
+    """A patient's surfaces that a scan shows again, LPS mm: points on skin and bones, and on other organs."""
 
     sample: Sample
     organs: Sample
@@ -104,7 +104,7 @@ def body_of(
 
 @dataclass(frozen=True, eq=False)
 class Tie:
-    """Where the case's frame lies in a scan."""
+    """Pose of the case's frame in a scan."""
 
     T_scan_ct: Floats  # shape (4, 4)
     cov_ct: Floats  # shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case
@@ -209,7 +209,7 @@ class _Picture:
         self.low, self.high, self.middle = bounds.min(axis=0), bounds.max(axis=0), bounds.mean(axis=0)
 
     def holds(self, points: Floats, beyond_mm: float = 0.0) -> Bools:
-        """Which of points (n, 3) lie in the box about the image."""
+        """Points (n, 3) that lie in the box about the image."""
         return np.asarray(((points > self.low - beyond_mm) & (points < self.high + beyond_mm)).all(axis=1))
 
     def shown(self, sample: Sample, T: Floats) -> Sample:
@@ -221,13 +221,13 @@ class _Picture:
         index = np.moveaxis(apply(self.T_index_ct, points.reshape(-1, 3)), 1, 0)
         near = np.clip(np.rint(index).astype(int), 0, np.array(self.values.shape)[:, None] - 1)
         outside = (np.abs(index - near) > 0.51).any(axis=0)
-        found = ndimage.map_coordinates(self.values, index, np.float64, order=1, mode="nearest")
-        found[outside | (found > METAL_HU)] = np.nan
-        return np.asarray(np.clip(found, *SHOWN_HU).reshape(points.shape[:-1]))
+        values = ndimage.map_coordinates(self.values, index, np.float64, order=1, mode="nearest")
+        values[outside | (values > METAL_HU)] = np.nan
+        return np.asarray(np.clip(values, *SHOWN_HU).reshape(points.shape[:-1]))
 
 
 def _edges(picture: _Picture, points: Floats, normals: Floats, window_mm: float) -> Floats:
-    """How far along each normal the surface lies, shape (n,), mm: NaN where none is seen, infinite outside."""
+    """Distance of the surface along each normal, shape (n,), mm: NaN where none is seen, infinite outside."""
     steps = np.arange(-window_mm, window_mm + STEP_MM / 2, STEP_MM)
     profile = picture.at(points[:, None] + steps[:, None] * normals[:, None])
     unseen = np.isnan(profile).any(axis=1)
@@ -240,8 +240,8 @@ def _edges(picture: _Picture, points: Floats, normals: Floats, window_mm: float)
     places = steps[:-1] + STEP_MM * np.clip((profile[:, :-1] - level) / drop, 0.0, 1.0)
     places = np.where(falls, places, np.inf)
     nearest = places[np.arange(len(places)), np.abs(places).argmin(axis=1)]
-    found = np.where((high - low >= CONTRAST_HU) & np.isfinite(nearest), nearest, np.nan)
-    return np.where(unseen, np.inf, found)
+    edges = np.where((high - low >= CONTRAST_HU) & np.isfinite(nearest), nearest, np.nan)
+    return np.where(unseen, np.inf, edges)
 
 
 def _fitted(picture: _Picture, sample: Sample, start: Floats) -> _Fit:
@@ -351,7 +351,7 @@ def _organs_moved(picture: _Picture, organs: Sample, T: Floats) -> Floats:
 
 
 def _evidence(picture: _Picture, body: Body, T: Floats, shift: Floats, pieces: Floats) -> float:
-    """How plainly organs change grey values, in standard errors, and markers that are where they should be."""
+    """Change of grey values at organs, in standard errors, and the markers that are where they should be."""
     total, step = 0.0, _fall(picture, body.organs, T @ pose(np.eye(3), shift))
     known = np.isfinite(step)
     for number in np.unique(body.organs.structure):
@@ -389,7 +389,7 @@ def _by_distances(markers: NamedPoints | None, pieces: Floats) -> Iterator[Float
     if markers is None or not 3 <= len(pieces) <= 40:
         return
     points, gaps = markers.points, np.linalg.norm(pieces[:, None] - pieces, axis=2)
-    found = []
+    peaks = []
     for rows in itertools.combinations(range(len(points)), 3):  # any of the others may be off, or outside
         corners = points[list(rows)]
         known = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
@@ -398,8 +398,8 @@ def _by_distances(markers: NamedPoints | None, pieces: Floats) -> Iterator[Float
             for k in np.flatnonzero(fits & (np.arange(len(pieces)) != i) & (np.arange(len(pieces)) != j)):
                 T = fit_rigid(corners, pieces[[i, j, k]])
                 left = np.linalg.norm(apply(T, points)[:, None] - pieces, axis=2).min(axis=1)
-                found.append((float(np.minimum(left, SIDES_MM).sum()), T))
-    yield from (T for _, T in sorted(found, key=lambda one: one[0])[:3])
+                peaks.append((float(np.minimum(left, SIDES_MM).sum()), T))
+    yield from (T for _, T in sorted(peaks, key=lambda one: one[0])[:3])
 
 
 def _by_markers(volume: Volume, body: Body, fit: _Fit, pieces: Floats, same_frame: bool) -> Tie:

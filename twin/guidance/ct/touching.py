@@ -75,12 +75,12 @@ def touch_tour(tour: TouchTour, arm: TouchingArm, checkers: ApproachCheckers, pr
     try:
         for number, touch in enumerate(tour.touches):
             with arm.at_marker(touch) as q:
-                found = _touch(tour, touch, _line(tour, touch, q, checkers), arm)
-            if isinstance(found, FailedTouch):
-                failed[touch.name] = found.why
+                touch_line = _touch(tour, touch, _line(tour, touch, q, checkers), arm)
+            if isinstance(touch_line, FailedTouch):
+                failed[touch.name] = touch_line.why
             else:
-                readings.append(found)
-            seconds += found.seconds
+                readings.append(touch_line)
+            seconds += touch_line.seconds
             progress(number + 1, len(tour.touches))
         seconds += arm.move(tour.leave, in_air=True).seconds
     except StoppedError as stop:

@@ -83,8 +83,8 @@ def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
     slope = gaussian_filter1d(read, SMOOTHING_PX / STEP_PX, axis=0, order=1, mode="nearest") / STEP_PX
     every, best = np.arange(spokes.number), np.argmax(np.abs(slope), axis=0)
     middle = np.clip(best, 1, len(slope) - 2)
-    before, here, after = (np.abs(slope[middle + side, every]) for side in (-1, 0, 1))
-    bend = before - 2 * here + after
+    before, centre, after = (np.abs(slope[middle + side, every]) for side in (-1, 0, 1))
+    bend = before - 2 * centre + after
     shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)  # a parabola's peak
     edge = spokes.half_angle + ((middle + np.clip(shift, -1, 1)) * STEP_PX - half) / scales
     contrast = -slope[middle, every] * np.hypot(SMOOTHING_PX, EDGE_WIDTH_PX) * np.sqrt(2 * np.pi)

@@ -86,7 +86,7 @@ class Camera:
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def sees(self, pixels: Floats, margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """Whether pixels (..., 2) lie in the image, at least a margin from its border; NaN does not."""
+        """Pixels (..., 2) that lie in the image, at least a margin from its border; NaN does not."""
         low = margin_px - 0.5
         high = np.array([self.width, self.height]) - 0.5 - margin_px
         with np.errstate(invalid="ignore"):
@@ -191,24 +191,24 @@ def coefficient_slope(points: Floats) -> Floats:
 
 def undistort(points: Floats, coefficients: Floats) -> Floats:
     """Inverse of ``distort`` by Newton, shape (..., 2); NaN where the lens sends no direction to."""
-    found = np.array(points, dtype=np.float64)
+    undistorted = np.array(points, dtype=np.float64)
     if not np.any(coefficients):
-        return found
-    step = np.full(found.shape, np.inf)
+        return undistorted
+    step = np.full(undistorted.shape, np.inf)
     for _ in range(MAX_STEPS):
-        slope = distortion_slope(found, coefficients)
-        miss = points - distort(found, coefficients)
+        slope = distortion_slope(undistorted, coefficients)
+        miss = points - distort(undistorted, coefficients)
         determinant = slope[..., 0, 0] * slope[..., 1, 1] - slope[..., 0, 1] ** 2
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             step[..., 0] = (slope[..., 1, 1] * miss[..., 0] - slope[..., 0, 1] * miss[..., 1]) / determinant
             step[..., 1] = (slope[..., 0, 0] * miss[..., 1] - slope[..., 0, 1] * miss[..., 0]) / determinant
-            found += step  # a 2 x 2 system by Cramer's rule
+            undistorted += step  # a 2 x 2 system by Cramer's rule
         if not np.any(np.abs(step) > CONVERGED):
             break
-    r2 = np.sum(found**2, axis=-1)
+    r2 = np.sum(undistorted**2, axis=-1)
     with np.errstate(invalid="ignore"):
         unique = (np.max(np.abs(step), axis=-1) <= 100 * CONVERGED) & (r2 < fold(coefficients) ** 2)
-    return np.where(unique[..., None], found, np.nan)
+    return np.where(unique[..., None], undistorted, np.nan)
 
 
 def fold(coefficients: Floats) -> float:

@@ -218,17 +218,17 @@ def calibrate(
     spread, sigma = np.full(14, np.inf), 0.05  # the pixels' deviation weighs the prior, and the residuals estimate it
     spread[4:8] = LENS_PRIOR if distortion else 0.0
     for _ in range(ROUNDS):
-        found = _fitted(start, points, pixels, spread, sigma**2)
+        fitted = _fitted(start, points, pixels, spread, sigma**2)
         with np.errstate(divide="ignore", invalid="ignore"):  # a prior's parameter is known as its variance fell
-            known = np.where(spread > 0, np.clip(1 - np.diag(found.covariance) / spread**2, 0, 1), 0)
+            known = np.where(spread > 0, np.clip(1 - np.diag(fitted.covariance) / spread**2, 0, 1), 0)
         spare = max(2 * len(points) - float(np.sum(known)), 1.0)
-        sigma = max(float(np.sqrt(np.sum(found.residuals_px**2) / spare)), SMALLEST_SIGMA_PX)
-    unseen = np.asarray(~np.isfinite(found.camera.project(points)).all(axis=1))
+        sigma = max(float(np.sqrt(np.sum(fitted.residuals_px**2) / spare)), SMALLEST_SIGMA_PX)
+    unseen = np.asarray(~np.isfinite(fitted.camera.project(points)).all(axis=1))
     if unseen.any():
         what = f"behind the camera or beyond its lens: {_listed(names, unseen)}"
         refuse(what, where, "all points in its view", "behind_camera")
-    _check_misses(found.residuals_px, names, where)
-    return found
+    _check_misses(fitted.residuals_px, names, where)
+    return fitted
 
 
 def _fitted(start: Camera, points: Floats, pixels: Floats, spread: Floats, variance: float) -> CameraCalibration:

@@ -388,30 +388,30 @@ class NeedleError:
         return float(hit_in_mesh(rays_to_ball(self.offset_m, radius_mm), self.tip_covariance[None])[0])
 
 
-def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
+def servoed_error(adjusted: Adjusted, stay: int, target_m: Floats) -> NeedleError:
     """The needle's error after an image of the ball at a stay, -1 the last; target (3,), mm, as the image has it."""
-    model, x = found.model, found.unknowns
+    model, x = adjusted.model, adjusted.unknowns
     stay = stay % len(x.balls_c)
     miss, slopes = model.ball_deviations(x, np.array([stay]))
-    rod = _Flange.of(found, model.observed.q_command[stay])
+    rod = _Flange.of(adjusted, model.observed.q_command[stay])
     variance, Jq = model.observed.errors.arrival**2, rod.arrival_slopes
     K = variance * Jq[:3].T @ np.linalg.inv(variance * Jq[:3] @ Jq[:3].T + FLOOR_MM**2 * np.eye(3))
-    rows = np.zeros((6, len(found.covariance)))
+    rows = np.zeros((6, len(adjusted.covariance)))
     start = x.span("balls_c").start + 3 * stay
     rows[:3, start : start + 3] = np.eye(3)  # the tip follows the ball that was seen
     rows[3:] = rod.rows[3:] + Jq[3:] @ K @ slopes[0]
     again = np.zeros((6, 6))
     again[3:, 3:] = Jq[3:] @ (variance * (np.eye(6) - K @ Jq[:3])) @ Jq[3:].T  # of this arrival, given r
     R_c_flange = exp_rotation(Jq[3:] @ K @ miss[0]) @ rod.R_c_flange  # by its mean, K r
-    return _needle(found, target_m, x.balls_c[stay], R_c_flange, rows, again)
+    return _needle(adjusted, target_m, x.balls_c[stay], R_c_flange, rows, again)
 
 
-def open_loop_error(found: Adjusted, q_command: Floats, target_m: Floats) -> NeedleError:
+def open_loop_error(adjusted: Adjusted, q_command: Floats, target_m: Floats) -> NeedleError:
     """The needle's error where the arm is sent to joints (6,), rad, without an image; target (3,), mm, in the image."""
-    rod = _Flange.of(found, q_command)
+    rod = _Flange.of(adjusted, q_command)
     Jq = rod.arrival_slopes
-    arrival = found.model.observed.errors.arrival**2 * Jq @ Jq.T
-    return _needle(found, target_m, rod.ball_c, rod.R_c_flange, rod.rows, arrival)
+    arrival = adjusted.model.observed.errors.arrival**2 * Jq @ Jq.T
+    return _needle(adjusted, target_m, rod.ball_c, rod.R_c_flange, rod.rows, arrival)
 
 
 class _Flange(NamedTuple):
@@ -423,12 +423,12 @@ class _Flange(NamedTuple):
     arrival_slopes: Floats  # shape (6, 6), per rad of each joint
 
     @classmethod
-    def of(cls, found: Adjusted, q_command: Floats) -> _Flange:
-        model, x = found.model, found.unknowns
+    def of(cls, adjusted: Adjusted, q_command: Floats) -> _Flange:
+        model, x = adjusted.model, adjusted.unknowns
         T, one = model.pose_of("base", x), model.rod_at(x, q_command[None])
         turn = np.kron(np.eye(2), T[:3, :3])
         ball = apply(T, one.ball)
-        rows = np.zeros((6, len(found.covariance)))
+        rows = np.zeros((6, len(adjusted.covariance)))
         rows[:3, x.span("base")] = model.slopes_of("base", x, ball)[0]
         rows[3:, x.span("base")] = _turn_rows(x.base)
         J = turn @ one.slopes[0]
@@ -437,20 +437,20 @@ class _Flange(NamedTuple):
 
 
 def _needle(
-    found: Adjusted, target_m: Floats, ball_c: Floats, R_c_flange: Floats, rows: Floats, again: Floats
+    adjusted: Adjusted, target_m: Floats, ball_c: Floats, R_c_flange: Floats, rows: Floats, again: Floats
 ) -> NeedleError:
     """The needle against a target (3,), mm.
 
     ``rows`` (6, N): what shifts its ball and rotates its flange, C; ``again`` (6, 6): what errs besides the unknowns.
     """
-    model, x, errors = found.model, found.unknowns, found.model.observed.errors
+    model, x, errors = adjusted.model, adjusted.unknowns, adjusted.model.observed.errors
     T_c_m, of_target, moved = model.pose_of("head", x), np.zeros_like(rows), np.zeros((6, 6))
     of_target[:3, x.span("head")] = model.slopes_of("head", x, apply(T_c_m, target_m[None]))[0]
     of_target[3:, x.span("head")] = _turn_rows(x.head)
     rows = rows - of_target  # tip minus target
     rotated, turn = np.kron(np.eye(2), R_c_flange), np.kron(np.eye(2), T_c_m[:3, :3])
     tool = np.repeat([errors.tip_offset_mm, errors.needle_direction, 0.0], [3, 2, 1]) ** 2  # no roll
-    cov_c = rows @ found.covariance @ rows.T + again + (rotated * tool) @ rotated.T
+    cov_c = rows @ adjusted.covariance @ rows.T + again + (rotated * tool) @ rotated.T
     moved[:3], moved[3:, :3] = turn_and_shift_slopes((target_m - x.markers_m.mean(axis=0))[None])[0], np.eye(3)
     head = np.repeat([errors.head_turn, errors.head_shift_mm], 3) ** 2  # since its markers were seen, about these
     covariance = turn.T @ cov_c @ turn + (moved * head) @ moved.T

@@ -284,7 +284,7 @@ class ServoCase:
 
     @property
     def hough_only(self) -> bool:
-        """Whether a ball's centre is that of the paper's method."""
+        """True where a ball's centre is that of the paper's method."""
         return self.file.cameras.centre == "hough"
 
     @property

@@ -291,10 +291,11 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: CellChecker, *
         q = nearest_within_limits(rod.model, every[:, branch], REFERENCE_RAD)
         if np.isnan(q).any():
             continue
-        found = checker.first_contact(q, needle_may_touch_patient=False)
-        if found is None:
+        contact = checker.first_contact(q, needle_may_touch_patient=False)
+        if contact is None:
             return Posture(q, branch)
-        why = f"{found.contact.body} would touch {found.contact.other} at point {found.at + 1} of {len(points_base)}"
+        bodies = f"{contact.contact.body} would touch {contact.contact.other}"
+        why = f"{bodies} at point {contact.at + 1} of {len(points_base)}"
     raise NoAnswerError(why, code="motion_touches")
 
 
@@ -412,9 +413,9 @@ def path_contact(checker: CellChecker, q_path: Floats) -> Contact | None:
 
 def look_again(look: Look, q_command: Floats, looks: int) -> Seen | Lost:
     """Look, and look again where the ball was not found, without moving the arm."""
-    found = look(q_command)
+    seen = look(q_command)
     for _ in range(looks - 1):
-        if isinstance(found, Seen):
+        if isinstance(seen, Seen):
             break
-        found = look(q_command)
-    return found
+        seen = look(q_command)
+    return seen

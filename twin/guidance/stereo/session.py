@@ -191,7 +191,7 @@ class Guide:
 
     def needle_unseen(self, q_command: Floats) -> NeedleError | None:
         """Predicted needle at commanded joints (6,), rad; None where the estimate does not settle."""
-        return self._believed(lambda found: open_loop_error(found, q_command, self.target_m))
+        return self._believed(lambda adjusted: open_loop_error(adjusted, q_command, self.target_m))
 
     def corrected_jp(self, q_command: Floats) -> Floats | None:
         """Joints (6,), rad, near the commanded ones that bring the ball onto the target by the arm's estimated errors.
@@ -206,7 +206,7 @@ class Guide:
 
     def needle_seen(self) -> NeedleError | None:
         """Predicted needle after the last image with its ball; None where the estimate does not settle."""
-        return self._believed(lambda found: servoed_error(found, -1, self.target_m))
+        return self._believed(lambda adjusted: servoed_error(adjusted, -1, self.target_m))
 
     def _believed(self, estimate: Callable[[Adjusted], NeedleError]) -> NeedleError | None:
         try:
@@ -261,9 +261,9 @@ class JointGuide(Guide):
 
     def _assess(self, detections: Detections) -> Seen:
         super()._assess(detections)
-        found = self.adjusted().offset(-1, self.target_m)
-        self.target_c = found.target_c
-        return Seen(found.ball_c, found.target_c, found.ball_covariance)
+        offset = self.adjusted().offset(-1, self.target_m)
+        self.target_c = offset.target_c
+        return Seen(offset.ball_c, offset.target_c, offset.ball_covariance)
 
 
 class ImageReading(NamedTuple):
@@ -298,7 +298,7 @@ def map_markers(
 
 @dataclass(frozen=True, eq=False)
 class Aims:
-    """Where the arm is sent for some of a case's targets, by calibration and mapping alone."""
+    """Commands of the arm for some of a case's targets, by calibration and mapping alone."""
 
     numbers: tuple[int, ...]  # of the targets
     q_hover: Floats  # shape (n, 6), rad: above each
@@ -316,7 +316,7 @@ class Aims:
 
 
 def step_limits(case: ServoCase) -> StepLimits:
-    """What one step of the servo may do."""
+    """Limits of one step of the servo."""
     limits = case.file.servo
     joint_step, drift = np.radians([limits.max_joint_step_deg, limits.max_drift_deg]).tolist()
     return StepLimits(limits.max_step_mm, joint_step, drift, limits.joints)
@@ -325,7 +325,7 @@ def step_limits(case: ServoCase) -> StepLimits:
 def aims_of(
     case: ServoCase, calibration: RobotCalibration, mapping: Mapping, targets_m: Floats, wanted: Sequence[str] | None
 ) -> Aims:
-    """Where the arm is sent for the case's targets (k, 3), mm, as they are read, or for those whose names are wanted.
+    """Commands for the case's targets (k, 3), mm, as they are read, or for those whose names are wanted.
 
     Raises:
         NoAnswerError: A target cannot be reached.
@@ -345,7 +345,7 @@ def aims_of(
 def follow(
     case: ServoCase, guide: Guide, T_base_c: Floats, targets_m: Floats, stops: Sequence[tuple[str, Floats]], arm: Arm
 ) -> Iterator[dict[str, Any]]:
-    """What a session's looks at the ball say, stop by stop, as plain values: mm and degrees; None of a lost ball.
+    """Readings of the ball in a session, stop by stop, as plain values: mm and degrees; None of a lost ball.
 
     T_base_c (4, 4), mm, is as calibrated, targets (k, 3), mm, are in the image; a stop is the name of a target and
     joints (6,), rad.
@@ -408,7 +408,7 @@ class Recorder:
         self._joints, self._table = tuple(map(repr, np.degrees(self.measured_jp()).tolist())), ""
 
     def measured_jp(self) -> Floats:
-        """Where the arm rests: what is kept of a move."""
+        """Joints at which the arm rests after a move."""
         return self.devices.measured_jp()
 
     def measured_cp(self) -> Floats:
@@ -418,7 +418,7 @@ class Recorder:
         return point
 
     def pointed_cp(self, marker: str) -> Floats:
-        """Where the operator points."""
+        """The point that the operator marks."""
         point = self.devices.pointed_cp(marker)
         self._begin(MARKERS, marker, *map(repr, point.tolist()))
         return point
@@ -446,7 +446,7 @@ class Recorder:
 
 
 def picture_path(folder: Path, table: str, row: int, camera: int, number: int) -> Path:
-    """Where a picture lies; row, camera and number count from 1."""
+    """Path of a picture; row, camera and number count from 1."""
     return folder / f"{table}_{row:03d}_{camera}_{number}.png"
 
 
@@ -486,7 +486,7 @@ class Replay:
         return np.asarray(self.tables[POINTS].values[self._at[POINTS] - 1, 6:])
 
     def pointed_cp(self, marker: str) -> Floats:
-        """Where the operator pointed, shape (3,), mm, C.
+        """The point that the operator marked, shape (3,), mm, C.
 
         Raises:
             InputError: A marker that was not recorded.
@@ -524,14 +524,14 @@ class Replay:
         Raises:
             InputError: Other names than the case's.
         """
-        found = []
+        contents = []
         for file, own in zip(IMAGE_POINTS, (markers, targets), strict=True):
             path = self.folder / file
             points = read_points(path, default_unit=Unit.MM) if is_plain_file(path) else own
             if set(points.names) != set(own.names):
                 refuse(f"names {', '.join(points.names)}", path, f"the case's: {', '.join(own.names)}", "names_differ")
-            found.append(points.points[[points.names.index(name) for name in own.names]])
-        return ImageReading(*found)
+            contents.append(points.points[[points.names.index(name) for name in own.names]])
+        return ImageReading(*contents)
 
 
 def read_recording(folder: Path, size_px: tuple[int, int]) -> Replay:

@@ -25,7 +25,7 @@ JOG_TOUCHES = "jog would touch"
 
 
 class ProbeDevices(NamedTuple):
-    """What a recording is made with."""
+    """Devices that make a recording."""
 
     probe_arm: Arm
     needle_arm: Arm
@@ -155,16 +155,16 @@ def _shot(
         return JOG_TOUCHES
     turn_needle = arms[1].move(q_needle)
     image = devices.probe.measured_image()
-    found = detect(image, case.content.image.imager())
-    return ProbeShot(number, row, q_probe, q_needle, turn_probe, turn_needle, image, found)
+    detection = detect(image, case.content.image.imager())
+    return ProbeShot(number, row, q_probe, q_needle, turn_probe, turn_needle, image, detection)
 
 
 def _recording(case: SelfcalCase, shots: list[ProbeShot], missed: list[ProbeShot], *, play: bool) -> Recording:
-    found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
+    detections = [shot.found for shot in shots if isinstance(shot.found, Detection)]
     keys = ("q_probe", "q_needle", *(("turn_probe", "turn_needle") if play else ()))
     parts: dict[str, Any] = {key: np.array([getattr(shot, key) for shot in shots]) for key in keys}
     A, B = (flange_pose(model, parts[key]) for model, key in zip(case.models, keys[:2], strict=True))
-    P, v = np.array([one.tip_image for one in found]), np.array([one.direction_image for one in found])
-    parts["shaft_mm"] = np.array([one.shaft_mm for one in found])
+    P, v = np.array([one.tip_image for one in detections]), np.array([one.direction_image for one in detections])
+    parts["shaft_mm"] = np.array([one.shaft_mm for one in detections])
     parts["missed"] = tuple((str(shot.number + 1), str(shot.found)) for shot in missed)
     return Recording(A, B, P, v, tuple(str(shot.number + 1) for shot in shots), **parts)

@@ -246,11 +246,11 @@ def detect(image: Pixels, imager: Imager, *, tip_bias: float = TIP_BIAS) -> Dete
     depth = np.array(max(float(line.point[1]), 0.0))
     lateral, axial = imager.spread.lateral_sigma(depth), imager.spread.axial_sigma(depth)
     blur = float(np.hypot(lateral * line.direction[0], axial * line.direction[1]))  # along the line at its end
-    found = line.point + (end - tip_bias * blur) * line.direction
-    if np.any(found < EDGE_MM) or np.any(found > np.array(imager.size_mm) - EDGE_MM):
+    tip = line.point + (end - tip_bias * blur) * line.direction
+    if np.any(tip < EDGE_MM) or np.any(tip > np.array(imager.size_mm) - EDGE_MM):
         return Missed.TIP_AT_EDGE
     contrast = 20.0 * float(np.log10(max(1.0 + step, 1e-6)))
-    return Detection(found, line.direction, contrast, -line.start)
+    return Detection(tip, line.direction, contrast, -line.start)
 
 
 def over_background(image: Pixels, imager: Imager) -> Floats:
@@ -266,9 +266,9 @@ def _segment(relative: Floats, imager: Imager) -> Segment:
     clipped = np.minimum(relative, BRIGHTEST) - 1.0 - EXPECTED
     small = np.asarray(cv2.GaussianBlur(clipped, (0, 0), COARSE / 1.5)[::COARSE, ::COARSE], dtype=np.float64)
     right = np.arange(*INCLINATIONS, ANGLE_STEP, dtype=np.float64)
-    found = brightest_segment(small, np.concatenate([right, np.pi - right]))
+    segment = brightest_segment(small, np.concatenate([right, np.pi - right]))
     pixel = imager.pixel_mm * COARSE
-    return Segment(found.start * pixel, found.end * pixel, found.score * pixel)
+    return Segment(segment.start * pixel, segment.end * pixel, segment.score * pixel)
 
 
 class _Line(NamedTuple):

@@ -71,11 +71,11 @@ class TwoArms:
         clearance = content.poses.clearance_mm
         phantom, table = phantom_mesh(content.phantom), table_box(content.phantom)
         T_base2_base1 = np.asarray(np.linalg.inv(case.T_base1_base2), dtype=np.float64)
-        moved = Box(table.name, T_base2_base1 @ table.T_base_box, table.size_mm)
+        box = Box(table.name, T_base2_base1 @ table.T_base_box, table.size_mm)
         tools = (probe_tool(case), needle_tool(case))
         self._probe = FastChecker(self.probe_model, tools[0], [table], phantom, padding_mm=clearance)
         phantom_base2 = phantom.transformed(T_base2_base1)
-        self._needle = FastChecker(self.needle_model, tools[1], [moved], phantom_base2, padding_mm=clearance)
+        self._needle = FastChecker(self.needle_model, tools[1], [box], phantom_base2, padding_mm=clearance)
         self._between = between_arms(case, case.T_end1_image, case.T_base1_base2, clearance)
         self._phantom = fcl.CollisionObject(surface(phantom))
         placed = fcl.Transform(table.T_base_box[:3, :3], table.T_base_box[:3, 3])
@@ -452,11 +452,11 @@ def expected_error_mm(calibration: Calibration, poses: Recording) -> float:
     return float(np.sqrt(np.mean(np.trace(calibration.tip_covariances(poses), axis1=1, axis2=2))))
 
 
-def predicted_tre(found: Calibration, recording: Recording) -> float:
+def predicted_tre(calibration: Calibration, recording: Recording) -> float:
     """Expected (rms) error at the recorded tips, mm: from the calibration, the declared arms, an image that errs."""
-    known = rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
-    image_mm = found.image.rms_mm if found.image is not None and found.image.significant else 0.0
-    return float(np.hypot(expected_error_mm(found, recording) if known is None else known, image_mm))
+    known = rms(calibration.predicted_tre_mm(recording.P, recording.A)) if calibration.arms is None else None
+    image_mm = calibration.image.rms_mm if calibration.image is not None and calibration.image.significant else 0.0
+    return float(np.hypot(expected_error_mm(calibration, recording) if known is None else known, image_mm))
 
 
 def recorded_pose(models: tuple[UrModel, UrModel], q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:

@@ -106,7 +106,7 @@ def recording_file(path: Path) -> Path:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a recording that says all by itself; see `open_recording`."""
+    """Read a recording that needs no case; see `open_recording`."""
     return open_recording(path, None).recording
 
 
@@ -134,7 +134,7 @@ def open_recording(path: Path, case: SelfcalCase | None) -> ReadRecording:
 
 
 class _Seen(NamedTuple):
-    """What pictures show of the needle: P, v (n, 2), shaft (n,), mm, NaN where there is none; and why."""
+    """Needles detected in pictures: P, v (n, 2), shaft (n,), mm, NaN where there is none; and why."""
 
     P: Floats
     v: Floats
@@ -159,15 +159,15 @@ def _recording(table: GroupedTable, seen: _Seen | None, case: SelfcalCase | None
         poses = [flange_pose(model, q) for model, q in zip(case.models, joints, strict=True) if q is not None]
     P = np.column_stack([numbers[key] for key in ("P_mm", "P_w", "P_px") if key in numbers])
     v = np.column_stack([numbers[key] for key in ("v", "v_z") if key in numbers]) if "v" in numbers else None
-    kept = np.asarray(np.isfinite(P).all(axis=1))
-    if not kept.any():
-        refuse(f"none of {len(kept)} pictures shows a needle", "pictures", "pictures with a needle", "too_few_poses")
+    shows = np.asarray(np.isfinite(P).all(axis=1))
+    if not shows.any():
+        refuse(f"none of {len(shows)} pictures shows a needle", "pictures", "pictures with a needle", "too_few_poses")
     shaft = numbers["shaft"][:, 0] if "shaft" in numbers else None
     optional = dict(zip(OPTIONAL, (v, shaft, *joints, *turns), strict=True))
-    parts: dict[str, Any] = {key: None if one is None else one[kept] for key, one in optional.items()}
-    parts["names"] = tuple(np.array(names)[kept].tolist())
+    parts: dict[str, Any] = {key: None if one is None else one[shows] for key, one in optional.items()}
+    parts["names"] = tuple(np.array(names)[shows].tolist())
     parts["missed"] = () if seen is None else tuple(one for one in zip(names, seen.missed, strict=True) if one[1])
-    return Recording(poses[0][kept], poses[1][kept], P[kept], pixels="P_px" in numbers, **parts)
+    return Recording(poses[0][shows], poses[1][shows], P[shows], pixels="P_px" in numbers, **parts)
 
 
 def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: list[Input]) -> _Seen:
@@ -205,13 +205,13 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
                 what = f"{own.columns} x {own.rows} pixels of {own.pixel_mm:g} mm"
                 first = f"{imager.columns} x {imager.rows} of {imager.pixel_mm:g} mm, as {files[0]}"
                 refuse(what, path, first, "wrong_size")
-            imager, found = own, detect(grey, own)
-            if isinstance(found, Detection) and colour is not None and _covers(colour, found):
+            imager, detection = own, detect(grey, own)
+            if isinstance(detection, Detection) and colour is not None and _covers(colour, detection):
                 missed[row] = COVERED
-            elif isinstance(found, Detection):
-                P[row], v[row], shaft[row] = found.tip_image, found.direction_image, found.shaft_mm
+            elif isinstance(detection, Detection):
+                P[row], v[row], shaft[row] = detection.tip_image, detection.direction_image, detection.shaft_mm
             else:
-                missed[row] = found.value
+                missed[row] = detection.value
     if not coloured:
         return _Seen(P, v, shaft, tuple(missed), ())
     most = max(coloured, key=lambda name: coloured[name])
@@ -220,10 +220,10 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
     return _Seen(P, v, shaft, tuple(missed), (warning,))
 
 
-def _covers(colour: Floats, found: Detection) -> bool:
-    """Whether coloured pixels (n, 2), mm, lie on the needle's ridge near its tip."""
-    offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
-    along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
+def _covers(colour: Floats, detection: Detection) -> bool:
+    """True where coloured pixels (n, 2), mm, lie on the needle's ridge near its tip."""
+    offset, (along_u, along_v) = colour - detection.tip_image, detection.direction_image
+    along, across = offset @ detection.direction_image, offset @ np.array([-along_v, along_u])
     return bool(((np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < ENDS_AGREE_MM)).any())
 
 
@@ -239,8 +239,10 @@ def _pixel_mm(
         allowed = "a column pixel_mm, [image] pixel_mm in a case, or DICOM that states it"
         refuse("nothing states the size of its pixels", path, allowed, "pixel_size")
     if not np.allclose(sizes, sizes[0], rtol=SAME_SIZE):
-        said = " and ".join(f"{width:g} x {height:g}" for width, height in sizes)
-        refuse(f"pixels of {said} mm", path, "one size in file, column pixel_mm and [image] pixel_mm", "pixel_size")
+        stated_text = " and ".join(f"{width:g} x {height:g}" for width, height in sizes)
+        refuse(
+            f"pixels of {stated_text} mm", path, "one size in file, column pixel_mm and [image] pixel_mm", "pixel_size"
+        )
     if not PIXEL_MM[0] <= min(sizes[0]) <= max(sizes[0]) <= PIXEL_MM[1]:
         refuse(f"pixels of {sizes[0][0]:g} x {sizes[0][1]:g} mm", path, "{} to {} mm".format(*PIXEL_MM), "pixel_size")
     return sizes[0]
@@ -321,18 +323,18 @@ def checked_calibration(
             what = f"the flange of {name} is never farther than {farthest:.3g} mm from its base: metres?"
             refuse(what, where, ALLOWED, "wrong_unit")
     try:
-        found = calibrate_case(recording, case, hold=hold)
+        calibration = calibrate_case(recording, case, hold=hold)
     except InputError as error:
         rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
         if rms_mm > SUSPECT_MM:
             _refuse_slip(recording, rms_mm, where)
         raise error.at(where) from error
-    if found.rms_mm > SUSPECT_MM:
-        _refuse_slip(recording, found.rms_mm, where)
-    if found.rms_mm > SOUND_MM:
-        what = f"residuals of {found.rms_mm:.3g} mm (rms): the poses and the image do not belong together"
+    if calibration.rms_mm > SUSPECT_MM:
+        _refuse_slip(recording, calibration.rms_mm, where)
+    if calibration.rms_mm > SOUND_MM:
+        what = f"residuals of {calibration.rms_mm:.3g} mm (rms): the poses and the image do not belong together"
         refuse(what, where, f"residuals up to {SOUND_MM:g} mm; {ALLOWED}", "residuals_too_large")
-    return found
+    return calibration
 
 
 def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:

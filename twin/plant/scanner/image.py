@@ -105,12 +105,12 @@ MOST_SAMPLES = 1_000_000
 
 def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
     """The voxels that triangles (n, 3, 3) pass, shape (m, 3), each once; all in voxels, centres whole."""
-    found = [np.empty(0, np.int64)]
+    voxels = [np.empty(0, np.int64)]
     for points in _samples(corners):
         index = np.floor(points + 0.5).astype(np.int64)  # a voxel reaches half a voxel to each side
         inside = np.all((index >= 0) & (index < shape), axis=1)
-        found.append(np.unique(np.ravel_multi_index(tuple(index[inside].T), shape)))
-    return np.stack(np.unravel_index(np.unique(np.concatenate(found)), shape), axis=1)
+        voxels.append(np.unique(np.ravel_multi_index(tuple(index[inside].T), shape)))
+    return np.stack(np.unravel_index(np.unique(np.concatenate(voxels)), shape), axis=1)
 
 
 def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bools) -> Ints:

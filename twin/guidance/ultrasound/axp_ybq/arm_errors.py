@@ -49,7 +49,7 @@ class DeclaredArm(NamedTuple):
         return sigma
 
     def motions(self, q: Floats, turn: Floats) -> FlangeMotions:
-        """How the arm's errors move its flange at joints (n, 6), rad, that turned last by signs (n, 6), 0 unknown."""
+        """Motions of the flange by the arm's errors at joints (n, 6), rad, that rotated last by signs (n, 6)."""
         J, half = error_jacobian(self.model, q, 0.0), self.errors.backlash / 2
         slopes, joints = J[..., :N_ARM] * self.deviations(), J[..., ARM_PARAMETERS["joint"]]
         play = -half * joints * turn[:, None, :]  # -half the width times the direction of rotation
@@ -61,7 +61,7 @@ class DeclaredArm(NamedTuple):
 
 
 class FlangeMotions(NamedTuple):
-    """How the errors of one arm move its flange at n poses: shift (mm) and turn (rad) along the base's axes."""
+    """Motions of a flange at n poses by the errors of its arm: shift (mm) and rotation (rad) along the base's axes."""
 
     slopes: Floats  # shape (n, 6, 23), per standard deviation of each parameter; (n, 6, 29) with each joint's play
     play: Floats  # shape (n, 6), by the declared play from where the joints say
@@ -76,7 +76,7 @@ class DeclaredArms(NamedTuple):
 
 
 class FlangeErrors(NamedTuple):
-    """How both arms' errors move the flanges of a recording."""
+    """Motions of both flanges of a recording by the errors of their arms."""
 
     probe: FlangeMotions
     needle: FlangeMotions
@@ -91,14 +91,14 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> FlangeErrors:
     r = recording
     if r.q_probe is None or r.q_needle is None:
         refuse("the arms' errors need the joints", "recording", "columns A_q1_deg to B_q6_deg", "missing_column")
-    found = []
+    motions = []
     for arm, q, T, turn, of in (
         (declared.probe, r.q_probe, r.A, r.turn_probe, "A"),
         (declared.needle, r.q_needle, r.B, r.turn_needle, "B"),
     ):
         check_flanges(arm.model, q, T, names=[f"{of} in pose {name}" for name in r.names], where="recording")
-        found.append(arm.motions(q, np.zeros(q.shape) if turn is None else turn))
-    return FlangeErrors(*found)
+        motions.append(arm.motions(q, np.zeros(q.shape) if turn is None else turn))
+    return FlangeErrors(*motions)
 
 
 def corrected(T_base_flange: Floats, motion: Floats) -> Floats:

@@ -124,9 +124,9 @@ class Calibration(Shown):
         if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
             return warnings
         chance = 100.0 * self.chi_squared_chance()
-        said = f"chi-squared of the residuals is {ratio:.2f} times their degrees of freedom ({self.freedom})"
+        text = f"chi-squared of the residuals is {ratio:.2f} times their degrees of freedom ({self.freedom})"
         small = "the declared noise or arm errors are probably too small, and so are the stated errors"
-        return (*warnings, f"{said}: {small}; a correct declaration gives this in {chance:.2g} % of cases")
+        return (*warnings, f"{text}: {small}; a correct declaration gives this in {chance:.2g} % of cases")
 
     @property
     def covariance_counts(self) -> Floats:
@@ -215,10 +215,10 @@ class Calibration(Shown):
 def calibration_of(solution: Solution, cannot_show: tuple[str, ...], arms: DeclaredArms | None) -> Calibration:
     """The calibration of a solution, with what the poses cannot show."""
     problem, fit, observability, seen, image = solution
-    at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
-    freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
+    at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_used, len(problem.active)
+    freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_used.sum()) * problem.with_direction - p
     residuals, names = at_fit.residuals[:, :3], problem.recording.names
-    findings = [*direction_findings(names, kept & ~fit.direction_kept, seen)]
+    findings = [*direction_findings(names, kept & ~fit.direction_used, seen)]
     if image is not None and image.significant:
         findings.append(image.finding())
     return Calibration(
@@ -272,18 +272,18 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
         yield Finding("direction_sign", Severity.WARNING, text)
 
 
-def with_length(found: Calibration, length_mm: float) -> Calibration:
+def with_length(calibration: Calibration, length_mm: float) -> Calibration:
     """The calibration after t_Q <- t_Q - (V.t_Q - length) V."""
-    V, t_Q, p = found.needle_direction_end2, found.tip_end2, len(found.parameters)
+    V, t_Q, p = calibration.needle_direction_end2, calibration.tip_end2, len(calibration.parameters)
     bias = float(V @ t_Q) - length_mm
     full = np.eye(len(PARAMETERS))
     full[T_Q, T_Q] -= np.outer(V, V)
     full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
-    whole = np.eye(len(found.joint_covariance))
-    whole[:p, :p] = change = full[np.ix_(found.active, found.active)]
-    joint, region = np.asarray(whole @ found.joint_covariance @ whole.T), found.small_sample
+    whole = np.eye(len(calibration.joint_covariance))
+    whole[:p, :p] = change = full[np.ix_(calibration.active, calibration.active)]
+    joint, region = np.asarray(whole @ calibration.joint_covariance @ whole.T), calibration.small_sample
     return replace(
-        found,
+        calibration,
         tip_end2=read_only(t_Q - bias * V),
         covariance=read_only(joint[:p, :p]),
         tip_bias_mm=bias,
@@ -353,8 +353,8 @@ def calibrate(
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
     if arms is not None and recording.turn_probe is None and any(arm.errors.backlash > 0.0 for arm in arms):
         cannot.append(PLAY_SIGN)
-    found = calibration_of(solution, tuple(cannot), arms)
-    return found if needle_length_mm is None else with_length(found, needle_length_mm)
+    calibration = calibration_of(solution, tuple(cannot), arms)
+    return calibration if needle_length_mm is None else with_length(calibration, needle_length_mm)
 
 
 def _check(recording: Recording, scale: bool) -> None:
@@ -374,7 +374,7 @@ FALSE_ALARM = 1e-3
 
 
 class Shot(NamedTuple):
-    """What came of one shot: its residuals' chi-squared, and the limit beyond which it does not fit and is left out."""
+    """Test of one shot: its residuals' chi-squared, and the limit beyond which it does not fit and is left out."""
 
     name: str
     used: bool
@@ -409,7 +409,7 @@ class ShotByShot(Shown):
         return cls(calibration, read_only(np.linalg.inv(C)), read_only(np.zeros(len(C))))
 
     def with_shot(self, pose: Recording) -> ShotByShot:
-        """After one more shot of one pose, used where it fits; ``shots[-1]`` says so.
+        """The calibration after one more shot of one pose, used where it fits; ``shots[-1]`` states it.
 
         Raises:
             InputError: More than one pose, or no joints where the start declares arms.
@@ -451,7 +451,7 @@ class ShotByShot(Shown):
         step, p, full = C @ self.vector, len(start.parameters), np.zeros(N_PARAMETERS)
         full[start.active] = step[:p]
         after = start.estimate.moved(full)
-        found = replace(
+        calibration = replace(
             start,
             X=read_only(pose(after.R_X, after.t_X)),
             Y=read_only(pose(after.R_Y, after.t_Y)),
@@ -463,4 +463,4 @@ class ShotByShot(Shown):
             arm_errors=read_only(start.arm_errors + step[p:]),
             small_sample=None,
         )
-        return found if needle_length_mm is None else with_length(found, needle_length_mm)
+        return calibration if needle_length_mm is None else with_length(calibration, needle_length_mm)

@@ -70,7 +70,7 @@ class Estimate(NamedTuple):
     V: Floats  # shape (3,), unit, the needle's direction in end2
 
     def moved(self, step: Floats) -> Estimate:
-        """After a step (19,) in the order of ``PARAMETERS``: R Exp(w), sums of the rest, V on the sphere."""
+        """The estimate after a step (19,), as ``PARAMETERS``: R Exp(w), sums of the rest, V on the sphere."""
         V = self.V + tangent_basis(self.V) @ step[DIRECTION]
         R_X, R_Y = self.R_X @ exp_rotation(step[W_X]), self.R_Y @ exp_rotation(step[W_Y])
         t_X, t_Y, t_Q = self.t_X + step[T_X], self.t_Y + step[T_Y], self.t_Q + step[T_Q]
@@ -288,7 +288,7 @@ class Problem(NamedTuple):
 
 
 class WeightedProblem(NamedTuple):
-    """What Gauss-Newton is handed: a problem whose residuals have weights, shape (n, k); covariances follow them."""
+    """A problem for Gauss-Newton, whose residuals have weights, shape (n, k); covariances follow them."""
 
     problem: Problem
     weights: Floats
@@ -416,11 +416,11 @@ class SeenDirection(NamedTuple):
     sign_known: bool  # whether the direction from flange to tip says which end is the tip
 
 
-def needle_direction(estimate: Estimate, recording: Recording, kept: Bools) -> SeenDirection:
-    """V, from the directions that agree, or from the image plane alone; ``kept`` (n,): poses whose tip is trusted."""
+def needle_direction(estimate: Estimate, recording: Recording, trusted: Bools) -> SeenDirection:
+    """V, from the directions that agree, or from the image plane alone; ``trusted`` (n,): poses of usable tips."""
     if recording.v is not None:
-        return agreed_direction(estimate, recording, kept)
-    V = direction_from_plane(estimate, recording.subset(kept))
+        return agreed_direction(estimate, recording, trusted)
+    V = direction_from_plane(estimate, recording.subset(trusted))
     V = V if V @ estimate.t_Q > 0 else -V  # the tip lies ahead of the flange
     seen = np.ones(len(recording), dtype=bool)
     return SeenDirection(V, seen, 1.0, 1.0, ~seen, True)
@@ -441,8 +441,8 @@ def direction_from_plane(estimate: Estimate, recording: Recording) -> Floats:
     return np.asarray(np.linalg.svd(across_image)[2][-1])  # null vector: z.M_i V = 0
 
 
-def agreed_direction(estimate: Estimate, recording: Recording, kept: Bools) -> SeenDirection:
-    """V from the poses that agree on it: the mean of those whose tip is trusted, kept (n,), toward the tip.
+def agreed_direction(estimate: Estimate, recording: Recording, trusted: Bools) -> SeenDirection:
+    """V from the poses that agree on it: the mean of those whose tip is trusted (n,), toward the tip.
 
     It is without those far from the median axis. An axis alone does not say which way it points. The tip lies ahead of
     the flange, and where it lies along the needle that says it; else most of the directions do.
@@ -451,41 +451,41 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: Bools) -> S
         InputError: The directions have no common axis, or most of them point from the tip to the hub.
     """
     seen = directions_end2(estimate, recording)
-    axis, angles = _common_axis(seen, kept)
-    middle = float(np.median(angles[kept]))
+    axis, angles = _common_axis(seen, trusted)
+    middle = float(np.median(angles[trusted]))
     if middle > SCATTERED_RAD:
-        _refuse_scattered(estimate, recording, kept, middle)
+        _refuse_scattered(estimate, recording, trusted, middle)
     along = float(axis @ estimate.t_Q / np.linalg.norm(estimate.t_Q))
     known = abs(along) >= ALONG
-    axis = axis * np.sign(along if known else np.median(seen[kept] @ axis) or 1.0)
+    axis = axis * np.sign(along if known else np.median(seen[trusted] @ axis) or 1.0)
     backward = np.asarray(seen @ axis < 0.0)
-    if backward[kept].sum() > 0.5 * kept.sum():
+    if backward[trusted].sum() > 0.5 * trusted.sum():
         what = f"{counted(recording.names, backward, REVERSED)}: the tip would then be behind the flange"
         refuse(what, "recording", ALLOWED, "directions_reversed")
     agrees = (angles <= max(FAR * middle / HALF_NORMAL, LEAST_ANGLE)) & ~backward
-    total = (agrees & kept) @ seen
+    total = (agrees & trusted) @ seen
     V = np.asarray(total / np.linalg.norm(total))
-    found = direction_residuals(estimate._replace(V=V), recording, directions_image(recording, estimate))
-    inside, across = np.sqrt(np.mean(found[agrees & kept] ** 2, axis=0))
+    residuals = direction_residuals(estimate._replace(V=V), recording, directions_image(recording, estimate))
+    inside, across = np.sqrt(np.mean(residuals[agrees & trusted] ** 2, axis=0))
     inside, across = max(float(inside), LEAST_SPREAD), max(float(across), LEAST_SPREAD)
     return SeenDirection(V, agrees, inside, across, backward, known)
 
 
-def _common_axis(seen: Floats, kept: Bools) -> tuple[Floats, Floats]:
+def _common_axis(seen: Floats, trusted: Bools) -> tuple[Floats, Floats]:
     """The axis (3,) nearest to most of the directions (n, 3), whatever their sign, and each one's angle to it (n,)."""
-    longest = np.linalg.eigh(seen[kept].T @ seen[kept])[1][:, -1]  # signs do not matter to it
-    middle = np.median((seen * np.where(seen @ longest < 0.0, -1.0, 1.0)[:, None])[kept], axis=0)
+    longest = np.linalg.eigh(seen[trusted].T @ seen[trusted])[1][:, -1]  # signs do not matter to it
+    middle = np.median((seen * np.where(seen @ longest < 0.0, -1.0, 1.0)[:, None])[trusted], axis=0)
     axis = middle / np.linalg.norm(middle)
     return np.asarray(axis), np.arccos(np.clip(np.abs(seen @ axis), 0.0, 1.0))
 
 
-def _refuse_scattered(estimate: Estimate, recording: Recording, kept: Bools, middle: float) -> None:
+def _refuse_scattered(estimate: Estimate, recording: Recording, trusted: Bools, middle: float) -> None:
     assert recording.v is not None
     what = f"the directions have no common axis in the needle's flange: they scatter by {np.degrees(middle):.0f} deg"
     for slip, undo in SLIPS.items():
         v = np.array(recording.v)
         v[:, :2] = v[:, :2] @ undo.T
-        other = float(np.median(_common_axis(directions_end2(estimate, replace(recording, v=v)), kept)[1][kept]))
+        other = float(np.median(_common_axis(directions_end2(estimate, replace(recording, v=v)), trusted)[1][trusted]))
         if other < min(BETTER * middle, SCATTERED_RAD):
             what += f"; they would agree ({np.degrees(other):.1f} deg) if {slip}"
     refuse(what, "recording", ALLOWED, "directions_scattered")

@@ -50,8 +50,8 @@ class RobustFit(NamedTuple):
     """A fit, and the poses whose tip and whose direction it used, each of shape (n,)."""
 
     estimate: Estimate
-    tip_kept: Bools  # shape (n,): the tip of this pose was used
-    direction_kept: Bools  # shape (n,): its direction was used
+    tip_used: Bools  # shape (n,): the tip of this pose was used
+    direction_used: Bools  # shape (n,): its direction was used
     iterations: int
 
 
@@ -104,7 +104,7 @@ class Fitted(NamedTuple):
 
 def weighed(problem: Problem, fit: RobustFit) -> Fitted:
     """A problem linearised at its fit, with the poses that made it."""
-    weights = residual_weights(problem, fit.tip_kept, fit.direction_kept)
+    weights = residual_weights(problem, fit.tip_used, fit.direction_used)
     r, J, sigma, N = problem.linear_model(fit.estimate)
     W, p = whitener(sigma, weights), J.shape[2]
     if N is not None:
@@ -167,15 +167,15 @@ def settled(problem: Problem, fit: RobustFit) -> RobustFit:
     Raises:
         InputError: More than half of the poses disagree.
     """
-    n, kept = len(problem.recording), (fit.tip_kept, fit.direction_kept)
+    n, agree = len(problem.recording), (fit.tip_used, fit.direction_used)
     for _ in range(LOOKS):
-        if kept[0].sum() < max(LEAST_KEPT * n, len(problem.active) / 3 + 1):
-            what = f"only {int(kept[0].sum())} of {n} poses agree with each other"
+        if agree[0].sum() < max(LEAST_KEPT * n, len(problem.active) / 3 + 1):
+            what = f"only {int(agree[0].sum())} of {n} poses agree with each other"
             refuse(what, "recording", "a recording in which most tips are right", "poses_disagree")
-        again = refine(problem, fit.estimate, *kept)
-        fit = RobustFit(again.estimate, *kept, fit.iterations + again.iterations)
-        kept = agreeing(problem, fit)
-        if all(np.array_equal(new, old) for new, old in zip(kept, fit[1:3], strict=True)):
+        again = refine(problem, fit.estimate, *agree)
+        fit = RobustFit(again.estimate, *agree, fit.iterations + again.iterations)
+        agree = agreeing(problem, fit)
+        if all(np.array_equal(new, old) for new, old in zip(agree, fit[1:3], strict=True)):
             break
     return fit
 
@@ -219,18 +219,18 @@ def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[
     """
     at_fit = weighed(problem, fit)
     pulled = at_fit.jacobian @ at_fit.covariance @ at_fit.jacobian.transpose(0, 2, 1)
-    kept = []
-    for block, used in zip(blocks(problem), (fit.tip_kept, fit.direction_kept), strict=False):
+    agree = []
+    for block, used in zip(blocks(problem), (fit.tip_used, fit.direction_used), strict=False):
         own, r = at_fit.sigma[:, block.rows, block.rows], at_fit.residuals[:, block.rows]
         S = own + np.where(used, -1.0, 1.0)[:, None, None] * pulled[:, block.rows, block.rows]
         # what rounding and a pose of nearly full leverage leave of it, lifted to a thousandth of its own noise
         S = S + 1e-3 * np.trace(own, axis1=1, axis2=2)[:, None, None] / own.shape[1] * np.eye(own.shape[1])
         if alarm:
             size = squared_size(r, S)
-            kept.append(size <= block.limit * scale(size[used], block, ALARM_FRACTION))
+            agree.append(size <= block.limit * scale(size[used], block, ALARM_FRACTION))
         else:
-            kept.append(standardised(r, S, _axes(problem, fit.estimate, block), block, used) <= block.limit)
-    return kept[0], kept[1] & facing(problem, fit.estimate) if problem.with_direction else fit.direction_kept
+            agree.append(standardised(r, S, _axes(problem, fit.estimate, block), block, used) <= block.limit)
+    return agree[0], agree[1] & facing(problem, fit.estimate) if problem.with_direction else fit.direction_used
 
 
 def facing(problem: Problem, estimate: Estimate) -> Bools:
@@ -255,10 +255,10 @@ def blocks(problem: Problem) -> list[Block]:
     least = least_turn = 1.0
     if isinstance(noise, Spread):
         least, least_turn = (ROUNDING / noise.inside_mm) ** 2, (ROUNDING / noise.direction_rad) ** 2
-    found = [Block(slice(0, 3), _chi_squared(0.5, 3), _chi_squared(quantile, 3), least)]
+    kinds = [Block(slice(0, 3), _chi_squared(0.5, 3), _chi_squared(quantile, 3), least)]
     if problem.with_direction:
-        found.append(Block(slice(3, 4), _chi_squared(0.5, 1), _chi_squared(quantile, 1), least_turn))
-    return found
+        kinds.append(Block(slice(3, 4), _chi_squared(0.5, 1), _chi_squared(quantile, 1), least_turn))
+    return kinds
 
 
 def _chi_squared(level: float, freedom: int) -> float:
@@ -279,8 +279,8 @@ def standardised(r: Floats, S: Floats, axes: Floats, block: Block, used: Bools) 
     is found to .1 mm along the shaft and to .01 mm across it, by exact poses, has residuals of one dimension, whose
     largest are further from their median than those of three dimensions.
     """
-    turned = axes.transpose(0, 2, 1)
-    r, S = (turned @ r[:, :, None])[:, :, 0], turned @ S @ axes
+    to_axes = axes.transpose(0, 2, 1)
+    r, S = (to_axes @ r[:, :, None])[:, :, 0], to_axes @ S @ axes
     pooled = scale(squared_size(r, S)[used], block)
     single = np.median((r**2 / np.diagonal(S, axis1=1, axis2=2))[used], axis=0) / _chi_squared(0.5, 1)
     return np.asarray(squared_size(r / np.sqrt(np.maximum(1.0, single / pooled)), S) / pooled)
@@ -355,10 +355,10 @@ def with_spreads(problem: Problem, fit: RobustFit) -> Problem:
 
 def _tip_parts(problem: Problem, at_fit: Fitted, fit: RobustFit) -> tuple[float, float]:
     """Spread of the tip's residuals inside and across the image, mm."""
-    to_image = (problem.recording.A[:, :3, :3] @ fit.estimate.R_X).transpose(0, 2, 1)[fit.tip_kept]
-    r = (to_image @ at_fit.residuals[fit.tip_kept, :3, None])[:, :, 0]
-    J = to_image @ at_fit.jacobian[fit.tip_kept, :3]
-    sigma = to_image @ at_fit.sigma[fit.tip_kept, :3, :3] @ to_image.transpose(0, 2, 1)
+    to_image = (problem.recording.A[:, :3, :3] @ fit.estimate.R_X).transpose(0, 2, 1)[fit.tip_used]
+    r = (to_image @ at_fit.residuals[fit.tip_used, :3, None])[:, :, 0]
+    J = to_image @ at_fit.jacobian[fit.tip_used, :3]
+    sigma = to_image @ at_fit.sigma[fit.tip_used, :3, :3] @ to_image.transpose(0, 2, 1)
     taken = ((J @ at_fit.covariance) * J).sum(axis=2) / np.diagonal(sigma, axis1=1, axis2=2)
     squares, freedom = (r**2).sum(axis=0), len(r) - taken.sum(axis=0)
     if freedom.sum() < LEAST_FREEDOM or freedom[2] < LEAST_FREEDOM / 5:
@@ -374,7 +374,7 @@ def _within_ratio(inside: float, across: float) -> tuple[float, float]:
 
 def _direction_part(at_fit: Fitted, fit: RobustFit, column: int, spread: Floats) -> float:
     """Size of one of the direction's two residuals, rad: the factor of its spread (n,), whose mean square is 1."""
-    used = fit.direction_kept
+    used = fit.direction_used
     r, J, expected = at_fit.residuals[used, column], at_fit.jacobian[used, column], at_fit.sigma[used, column, column]
     freedom = len(r) - float((((J @ at_fit.covariance) * J).sum(axis=1) / expected).sum())
     return max(float(np.sqrt(np.sum((r / spread[used]) ** 2) / max(freedom, 1.0))), LEAST_RAD)
@@ -410,17 +410,17 @@ def structures(problem: Problem, fit: RobustFit) -> dict[str, Floats]:
     """Covariance of the residuals (n, k, k) that each found part has at size 1, by its name."""
     image = problem.recording.A[:, :3, :3] @ fit.estimate.R_X
     n, k = len(problem.recording), 5 if problem.with_direction else 3
-    found: dict[str, Floats] = {}
+    parts: dict[str, Floats] = {}
     if isinstance(problem.noise, Spread):
         for name, axes in (("inside", image[:, :, :2]), ("across", image[:, :, 2:])):
-            found[name] = np.zeros((n, k, k))
-            found[name][:, :3, :3] = axes @ axes.transpose(0, 2, 1)
+            parts[name] = np.zeros((n, k, k))
+            parts[name][:, :3, :3] = axes @ axes.transpose(0, 2, 1)
     if problem.with_direction:
-        rows = {"lean": 4} if not found else {"turn": 3, "lean": 4}
+        rows = {"lean": 4} if not parts else {"turn": 3, "lean": 4}
         for name, row in rows.items():
-            found[name] = np.zeros((n, k, k))
-            found[name][:, row, row] = problem.recording.direction_spread**2 if name == "turn" else 1.0
-    return found
+            parts[name] = np.zeros((n, k, k))
+            parts[name][:, row, row] = problem.recording.direction_spread**2 if name == "turn" else 1.0
+    return parts
 
 
 def _moved_tip_parts(spread: Spread, inside: tuple[float, float], across: tuple[float, float]) -> tuple[float, float]:
@@ -521,7 +521,7 @@ class ImageErrors(NamedTuple):
 
     @property
     def significant(self) -> bool:
-        """Whether the test finds errors of the image."""
+        """True where the test finds errors of the image."""
         return self.probability < SIGNIFICANT
 
     def finding(self) -> Finding:
@@ -543,7 +543,7 @@ class ImageErrors(NamedTuple):
 
 def image_errors(problem: Problem, fit: RobustFit) -> ImageErrors | None:
     """The errors of the image at a fit; None where the poses cannot show them."""
-    weights = residual_weights(problem, fit.tip_kept, fit.direction_kept)
+    weights = residual_weights(problem, fit.tip_used, fit.direction_used)
     model = problem.linear_model(fit.estimate)
     free = SCALE.start not in problem.active
     wanted = np.array([free, free, True, problem.with_direction])
@@ -553,23 +553,23 @@ def image_errors(problem: Problem, fit: RobustFit) -> ImageErrors | None:
     columns = np.concatenate([tip, skewed, np.zeros_like(skewed)], axis=2)  # the residuals' slopes by a, b, k and w
     if problem.with_direction:
         c, s, _ = directions_image(recording, estimate).T
-        turned = np.stack([-c * s, c * s, -(s**2), np.ones(len(recording))], axis=1)
-        rows = np.stack([-turned, np.zeros_like(turned)], axis=1)
+        by_turn = np.stack([-c * s, c * s, -(s**2), np.ones(len(recording))], axis=1)
+        rows = np.stack([-by_turn, np.zeros_like(by_turn)], axis=1)
         columns = np.concatenate([columns, rows], axis=1)
     columns = columns[:, :, wanted]
     whitening = Whitening.of(model.sigma, model.shared, weights)
     A, more = whitening.slopes(model.jacobian), whitening.slopes(columns)
-    found = lacking(-whitening.residuals(model.residuals), A, more, count=int(weights.sum()))
-    if found is None:
+    errors = lacking(-whitening.residuals(model.residuals), A, more, count=int(weights.sum()))
+    if errors is None:
         return None
-    pulled = np.linalg.lstsq(A, more @ found.found, rcond=None)[0]
-    left = (columns @ found.found - model.jacobian @ pulled)[fit.tip_kept, :3]
+    pulled = np.linalg.lstsq(A, more @ errors.found, rcond=None)[0]
+    left = (columns @ errors.found - model.jacobian @ pulled)[fit.tip_used, :3]
     rms = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
-    return ImageErrors(tuple(np.array(list(ERRORS))[wanted].tolist()), found.found, found.sd, found.probability, rms)
+    return ImageErrors(tuple(np.array(list(ERRORS))[wanted].tolist()), errors.found, errors.sd, errors.probability, rms)
 
 
 class Solution(NamedTuple):
-    """What `solve` found."""
+    """Result of `solve`."""
 
     problem: Problem  # with the noise that the residuals show
     fit: RobustFit
@@ -583,18 +583,18 @@ def solve(problem: Problem, start: Estimate, *, direction: bool) -> Solution:
     recording = problem.recording
     fit = robust_fit(problem, start)
     try:
-        seen = needle_direction(fit.estimate, recording, fit.tip_kept)
+        seen = needle_direction(fit.estimate, recording, fit.tip_used)
     except InputError:  # directions say little of poses that show too little
-        require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+        require_observable(fit.estimate, recording.subset(fit.tip_used), problem.active)
         raise
-    fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
-    observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+    fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_used=seen.agrees)
+    observability = require_observable(fit.estimate, recording.subset(fit.tip_used), problem.active)
     if direction:
         active = np.append(problem.active, [DIRECTION.start, DIRECTION.start + 1])
         problem = problem._replace(active=active, lean_rad=seen.lean_rad)
     if isinstance(problem.noise, Spread) or problem.with_direction:
-        before = fit.tip_kept
+        before = fit.tip_used
         problem, fit = refitted(problem, fit, seen)
-        if not np.array_equal(before, fit.tip_kept):
-            observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+        if not np.array_equal(before, fit.tip_used):
+            observability = require_observable(fit.estimate, recording.subset(fit.tip_used), problem.active)
     return Solution(problem, fit, observability, seen, image_errors(problem, fit))

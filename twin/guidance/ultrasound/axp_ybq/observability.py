@@ -139,7 +139,7 @@ def _named(
 
 
 def _ill_conditioned_part(J: Floats, active: Ints, motions: Floats, limit: float) -> tuple[int, Floats]:
-    """How many of three motions (17, 3) are ill-conditioned, and the weakest of their span, a unit vector (3,)."""
+    """Number of ill-conditioned motions of three (17, 3), and the weakest of their span, a unit vector (3,)."""
     q, triangle = np.linalg.qr(motions[active])
     _, values, Vt = np.linalg.svd(J @ q, full_matrices=False)
     weakest = np.linalg.solve(triangle, Vt[-1])
@@ -203,10 +203,10 @@ def require_observable(estimate: Estimate, recording: Recording, active: Ints) -
     Raises:
         Degenerate: They do not.
     """
-    found = observe(estimate, recording, active)
-    if found.ill_conditioned:
-        raise Degenerate(found, propose(estimate, recording, active))
-    return found
+    observability = observe(estimate, recording, active)
+    if observability.ill_conditioned:
+        raise Degenerate(observability, propose(estimate, recording, active))
+    return observability
 
 
 def propose(estimate: Estimate, recording: Recording, active: Ints) -> SuggestedPoses:
@@ -265,8 +265,8 @@ def _greedy(estimate: Estimate, recording: Recording, active: Ints, changes: lis
         H = H + gains[chosen[-1]]
     picked = tuple(changes[i] for i in chosen)
     counted = Counter(_in_words(pose) for pose in picked)
-    said = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
-    text = f"add {len(picked)} poses, each from pose {picked[0].reference}: " + "; ".join(said)
+    changes_text = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
+    text = f"add {len(picked)} poses, each from pose {picked[0].reference}: " + "; ".join(changes_text)
     return SuggestedPoses(picked, _ratio(H), text)
 
 

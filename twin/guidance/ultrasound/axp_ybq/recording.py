@@ -115,7 +115,7 @@ class Recording(Shown):
 
     @property
     def shaft_unit(self) -> float:
-        """Root mean square of what the shafts' lengths say of the directions' spreads; 1 where nothing does."""
+        """Root mean square of the directions' spreads by their shafts' lengths; 1 where those were not read."""
         return 1.0 if self.shaft_mm is None else float(np.sqrt(np.mean(self.shaft_mm ** (-2 * SHAFT_POWER))))
 
     def __len__(self) -> int:
@@ -124,8 +124,8 @@ class Recording(Shown):
     def subset(self, rows: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Recording:
         """The recording with these poses only."""
         parts = {key: getattr(self, key) for key in ("A", "B", "P", *OPTIONAL)}
-        kept: dict[str, Any] = {key: None if one is None else one[rows] for key, one in parts.items()}
-        return replace(self, names=tuple(np.array(self.names)[rows].tolist()), **kept)
+        selected: dict[str, Any] = {key: None if one is None else one[rows] for key, one in parts.items()}
+        return replace(self, names=tuple(np.array(self.names)[rows].tolist()), **selected)
 
 
 def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
