@@ -215,10 +215,10 @@ def parse_mesh(
 
     ``stretch``, shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
     """
-    name, actual = str(path), space
+    name, actual, header_space = str(path), space, _stated_space(data)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or NaN here, the guard refuses
         raw = _reader(path)(data, name)
-        stated = raw.space or _stated_space(data)
+        stated = raw.space or header_space
         if stated is not None and space_is_default and space is not Space.LOCAL:
             actual = stated
         elif stated not in (None, space) and (space is not Space.LOCAL or space_is_default):  # local is of its own
