@@ -167,7 +167,7 @@ class StructureSources:
             return None
         self._progress("CT with the structures")
         seen = self._seen(name, None, structures, skin_section.cut if own else None)
-        if not seen.surfaces.source.grid.holds(self._case.target_ct):
+        if not seen.surfaces.source.grid.contains(self._case.target_ct):
             what = f"[ct] file '{name}' does not contain the target: wrong file or space?"
             allowed = "a CT that contains the target, in the space of the structures"
             refuse(what, self._case.path, allowed, "target_outside_ct")

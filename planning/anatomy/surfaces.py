@@ -165,7 +165,7 @@ class VolumeSurfaces:
 
     def holds(self, what: str) -> bool:
         """Whether memory has what is `held` under this name."""
-        return self.cache.memory.holds(self._key(what))
+        return self.cache.memory.contains(self._key(what))
 
     def _key(self, what: str) -> tuple[str, ...]:
         return (__name__, what, self.path.name, *self.sha256)

@@ -232,7 +232,7 @@ def beyond_labels(
         target = apply(np.linalg.inv(voxels.T_ct_index), case.target_ct[None])[0]
         if np.any((target < faces[0]) | (target > faces[1])):
             what = f"label map {grid.name} does not contain the target, so its surroundings are unknown"
-            what += ENDS_FLAT.format(flat=flat.max()) if voxels.holds(case.target_ct) else ""
+            what += ENDS_FLAT.format(flat=flat.max()) if voxels.contains(case.target_ct) else ""
             refuse(what, case.path, "label maps that contain the target", "labels_end")
         sections = [one for one in case.structures if one.source == grid.name]
         named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]

@@ -1,4 +1,4 @@
-"""What every room needs and none of them owns: errors, reasons, files, provenance, TOML, names, processes, stages.
+"""Base of every room: errors, reasons, files, caches, provenance, strict JSON and TOML, names, processes, progress.
 
 Nothing here knows of needles, arms or anatomy.
 """

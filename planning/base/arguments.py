@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from puncture_twin.planning.base.arrays import Floats, any_masked
 from puncture_twin.planning.base.errors import InputError, refuse
 
-Given = ParamSpec("Given")
-Found = TypeVar("Found")
+Parameters = ParamSpec("Parameters")
+Returned = TypeVar("Returned")
 Word = TypeVar("Word", bound=StrEnum)
 RANGES: Mapping[str, tuple[float, float]] = MappingProxyType({
     "seed": (0, 2**31 - 1), "seeds": (1, 1_000_000), "jobs": (1, 1024), "points": (1, 100_000), "size_deg": (0.05, 10),
@@ -30,8 +30,8 @@ RANGES: Mapping[str, tuple[float, float]] = MappingProxyType({
 """Least and greatest of an argument, by its name."""
 
 
-def checked(function: Callable[Given, Found]) -> Callable[Given, Found]:
-    """Hold each argument against its annotation and `RANGES` before the function sees it.
+def checked(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
+    """The function, with each argument checked against its annotation and `RANGES` before the call.
 
     Annotations are read as words: whoever only registers markers loads no simulator for the sake of a type.
     """
@@ -39,7 +39,7 @@ def checked(function: Callable[Given, Found]) -> Callable[Given, Found]:
     words = {name: one.annotation.split(" | ") for name, one in signature.parameters.items()}
 
     @functools.wraps(function)
-    def guarded(*arguments: Given.args, **named: Given.kwargs) -> Found:
+    def guarded(*arguments: Parameters.args, **named: Parameters.kwargs) -> Returned:
         bound = signature.bind(*arguments, **named)
         for name, given in bound.arguments.items():
             value = given[()] if isinstance(given, np.ndarray) and given.ndim == 0 else given
@@ -62,7 +62,7 @@ def checked(function: Callable[Given, Found]) -> Callable[Given, Found]:
 def is_kind(word: str, value: object) -> bool:
     """Whether a value is of the kind that one word of an annotation names."""
     if word in KINDS:
-        return KINDS[word].holds(value)
+        return KINDS[word].accepts(value)
     return word.partition("[")[0] in {kind.__name__ for kind in type(value).__mro__}
 
 
@@ -82,10 +82,10 @@ MOST_PATH, MOST_NAME = 4096, 255
 
 
 class Kind(NamedTuple):
-    """What a word of an annotation means that is no class of this project."""
+    """A word of an annotation that is no class of this project: its text in errors, and the check of a value."""
 
     text: str
-    holds: Callable[[Any], bool]
+    accepts: Callable[[Any], bool]
 
 
 KINDS: Mapping[str, Kind] = MappingProxyType(
@@ -111,12 +111,12 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
 
 
 def shown_value(value: object) -> str:
-    """A value in an error: what it is, and a number or text itself."""
+    """Text of a value in an error: a number or text itself, else its type."""
     return repr(value)[:80] if isinstance(value, int | float | complex | str) else f"of type {type(value).__name__}"
 
 
 def word_of(kind: type[Word], word: str | None) -> Word | None:
-    """One of a few words; None for none. Raises InputError: another word."""
+    """The member of an enumeration that a word names; None for None. Raises InputError: another word."""
     try:
         return None if word is None else kind(word)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""The arrays of this project by what they hold; a docstring beside each use gives shape, unit and frame."""
+"""Array types by what they hold, and masks and counts of voxels; each use of a type states shape, unit and frame."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,7 +27,7 @@ class Columns:
 
 
 def read_only(array: ArrayLike, dtype: DTypeLike = np.float64) -> NDArray[Any]:
-    """A copy, any shape, that nobody can write to."""
+    """A read-only copy of an array, any shape."""
     copy = np.array(array, dtype=dtype)
     copy.setflags(write=False)
     return copy
@@ -54,34 +54,34 @@ def widened(mask: Bools, reach: Sequence[int] | NDArray[np.integer]) -> Bools:
     for axis, most in enumerate(reach):
         done = 0
         while done < most:
-            step = min(2 * done + 1, most - done)  # no farther than what is wide by now has no gap
-            wide = mask.copy()
-            _add_beside(wide, mask, axis, step)
-            mask, done = wide, done + step
+            reach_step = min(2 * done + 1, most - done)  # no farther than what has grown so far has no gap
+            grown_mask = mask.copy()
+            _add_neighbours(grown_mask, mask, axis, reach_step)
+            mask, done = grown_mask, done + reach_step
     return mask
 
 
 def grown(mask: Bools) -> Bools:
     """A mask and the neighbours of its voxels, those that share a face."""
-    wide = mask.copy()
+    grown_mask = mask.copy()
     for axis in range(mask.ndim):
-        _add_beside(wide, mask, axis, 1)
-    return wide
+        _add_neighbours(grown_mask, mask, axis, 1)
+    return grown_mask
 
 
-def _add_beside(wide: Bools, mask: Bools, axis: int, step: int) -> None:
-    """Set what lies a step beside a mask, to both ways of an axis."""
-    out, of = np.moveaxis(wide, axis, 0), np.moveaxis(mask, axis, 0)
-    out[step:] |= of[:-step]
-    out[:-step] |= of[step:]
+def _add_neighbours(target: Bools, mask: Bools, axis: int, step: int) -> None:
+    """Set the voxels that lie a step from a mask in both directions of an axis."""
+    out, source = np.moveaxis(target, axis, 0), np.moveaxis(mask, axis, 0)
+    out[step:] |= source[:-step]
+    out[:-step] |= source[step:]
 
 
-def counts_of(numbers: NDArray[np.integer], count: int) -> Ints:
-    """How many voxels have each number from 0 to ``count``; plane by plane."""
+def label_counts(numbers: NDArray[np.integer], count: int) -> Ints:
+    """Number of voxels of each label from 0 to ``count``, shape (count + 1,); counted plane by plane."""
     counts = np.zeros(count + 1, np.int64)
     for plane in numbers:
-        found = np.bincount(plane.ravel())
-        counts[: len(found)] += found
+        in_plane = np.bincount(plane.ravel())
+        counts[: len(in_plane)] += in_plane
     return counts
 
 

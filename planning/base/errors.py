@@ -18,7 +18,7 @@ from typing import Any, NoReturn, Self
 MOST_WHAT, MOST_WHERE, MOST_ALLOWED = 400, 300, 600
 """Characters of an error's parts: what is longer loses its middle, so that the line can still be read."""
 MOST_MESSAGE = 1_500
-"""Characters of any other line."""
+"""Most characters of any other line."""
 
 
 class PlanningError(Exception):
@@ -71,10 +71,10 @@ class InputError(PlanningError):
         return f"{self.where}: {self.what}; allowed: {self.allowed}"
 
     def at(self, where: str | Path) -> Self:
-        """This error with another place in it."""
-        moved = copy.copy(self)
-        moved.where = one_line(str(where), MOST_WHERE)
-        return moved
+        """A copy of the error, located at another place."""
+        relocated = copy.copy(self)
+        relocated.where = one_line(str(where), MOST_WHERE)
+        return relocated
 
 
 def refuse(what: str, where: str | Path, allowed: str, code: str) -> NoReturn:
@@ -94,13 +94,13 @@ def refusing(
 
 
 class InputListError(InputError):
-    """Several things that are wrong with one input, in one line."""
+    """Several faults of one input, in one line."""
 
     most_what = 900
 
 
 class SchemaError(ValueError):
-    """What a file's schema refuses: a sentence about keys, and its code."""
+    """A fault that a file's schema refuses: a sentence about keys, and its code."""
 
     def __init__(self, what: str, code: str) -> None:
         self.code = code
@@ -145,7 +145,7 @@ MUST_BE = MappingProxyType(
 
 
 def schema_words(error: Mapping[str, Any]) -> str:
-    """What is wrong with a key, in this project's words, of one of Pydantic's ``ValidationError.errors()``.
+    """A key's fault in this project's words, from one of Pydantic's ``ValidationError.errors()``.
 
     >>> schema_words({"type": "less_than_equal", "msg": "Input should be ...", "ctx": {"le": 10.0}})
     'must be 10 or less'
@@ -171,7 +171,7 @@ def one_line(text: str, most: int = MOST_MESSAGE) -> str:
 
 
 class Severity(StrEnum):
-    """How much a finding weighs."""
+    """Weight of a finding."""
 
     NOTE = "note"
     WARNING = "warning"
@@ -180,7 +180,7 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that the inputs say of each other."""
+    """One observation from inputs that are checked against each other."""
 
     code: str
     severity: Severity  # a refusal stops the work, a warning stands in every result, a note is for those who look

@@ -94,11 +94,11 @@ def new_folder(path: Path | None) -> Iterator[Path | None]:
         return
     if path.exists():
         refuse("is there already", path, "a new folder", "output_exists")
-    with tempfile.TemporaryDirectory(dir=check_writable(path.parent), prefix=".") as beside:
-        kept = Path(beside) / path.name
-        kept.mkdir()
-        yield kept
-        kept.replace(path)
+    with tempfile.TemporaryDirectory(dir=check_writable(path.parent), prefix=".") as parent:
+        draft = Path(parent) / path.name
+        draft.mkdir()
+        yield draft
+        draft.replace(path)
 
 
 def _shown(path: Path) -> str:
@@ -139,7 +139,7 @@ def absence(path: Path) -> str:
 
 
 def _other_case(path: Path) -> str:
-    """A name beside it that differs in upper and lower case alone; "" without one."""
+    """A name in the same folder that differs in upper and lower case alone; "" without one."""
     if not path.parent.is_dir():
         return ""
     names = sorted(one.name for one in path.parent.iterdir() if one.name.lower() == path.name.lower())
@@ -147,7 +147,7 @@ def _other_case(path: Path) -> str:
 
 
 def unfinished_warnings(content: bytes, name: str) -> tuple[str, ...]:
-    """What to say of a list whose last line does not end with a line break; spaces after it are no line."""
+    """Warnings about a list whose last line does not end with a line break; spaces after it are no line."""
     if content.rstrip(b" \t").endswith((b"\n", b"\r")):
         return ()
     return (f"{name}: its last line has no line break at its end; was the file cut?",)

@@ -1,4 +1,4 @@
-"""Numba, told where to keep compiled kernels: the one way by which kernels are compiled here.
+"""Numba with a cache folder of its own for compiled kernels: the one way by which kernels are compiled here.
 
 Numba knows a kept kernel by the source of its own file. A kernel that takes in another file's kernel, or names its
 constant, would be used on after an edit of that file alone, and a search would go on by the old rule. So each state of
@@ -45,14 +45,14 @@ LOCATORS = "UserProvidedCacheLocator,IPythonCacheLocator"
 """Numba's names: that place alone, and what a notebook's cells have. It would go on to folders of other states."""
 PREFIX = "kernels-"
 COMPILERS = ("numba", "llvmlite", "numpy")
-"""Whose versions decide what is compiled."""
+"""Libraries whose versions decide what is compiled."""
 KEPT_FOLDERS = 4
 KEPT_S = 7 * 86_400.0
 """Folders of other sources stay while they are among the newest, or were used within a week: checkouts share them."""
 ENDINGS = (".nbi", ".nbc")
-"""Of numba's indices and data; it writes under another name first."""
+"""Endings of numba's indices and data; it writes under another name first."""
 LAST_BYTE = b"."
-"""Of every pickle: a file that ends otherwise was cut, as by a system that went down while it was written."""
+"""Last byte of every pickle: a file that ends otherwise was cut, as by a system that went down while it was written."""
 SUMS = "sums.json"
 """What the folder's files were when a process that had used them ended: size, time and CRC-32. A bit that flips later
 is seen before the code runs; that costs 10 ms for the 17 MB of all commands."""
@@ -77,10 +77,10 @@ def _use_folder() -> None:
 
 def _place() -> Path:
     """Where the folders are: as the user tells numba, else in their folder for caches."""
-    told = os.environ.get(FOLDER_VARIABLE)
-    if told:
-        place = Path(told).absolute()
-        return place.parent if place.name.startswith(PREFIX) else place  # the process that began this one told it
+    stated = os.environ.get(FOLDER_VARIABLE)
+    if stated:
+        place = Path(stated).absolute()
+        return place.parent if place.name.startswith(PREFIX) else place  # the process that began this one stated it
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "puncture-twin"
 
@@ -107,7 +107,7 @@ def _own_folder(folder: Path) -> Path:
 
 
 State = list[int]
-"""Of a file: its size and time, then its sum where that is known."""
+"""A file's size and time, then its sum where that is known."""
 
 
 def _files(folder: Path) -> dict[str, State]:
@@ -122,7 +122,7 @@ def _files(folder: Path) -> dict[str, State]:
 
 
 def _sums(folder: Path) -> dict[str, State]:
-    """What is known of the files: nothing, where the list cannot be read."""
+    """Known states of the files: none, where the list cannot be read."""
     try:
         return {file: [*map(int, known)] for file, known in dict(json.loads((folder / SUMS).read_bytes())).items()}
     except (OSError, ValueError, TypeError):
@@ -130,7 +130,7 @@ def _sums(folder: Path) -> dict[str, State]:
 
 
 def _damaged(folder: Path) -> Iterator[Path]:
-    """Files that are not what was kept, and those that nobody knows and that were cut."""
+    """Files that differ from their known state, and unknown ones that were cut."""
     sums = _sums(folder)
     for file, state in _files(folder).items():
         with suppress(FileNotFoundError), open(file, "rb") as stream:  # noqa: PTH123  # as above

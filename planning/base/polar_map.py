@@ -23,19 +23,19 @@ from puncture_twin.planning.base.text import escape
 FINEST = np.radians(0.5)
 """rad: a smaller bin is smaller than a pixel at the rim."""
 MOST_BINS = 720
-"""Around the circle, and from the pole to the rim."""
+"""Most bins around the circle, and from the pole to the rim."""
 SLACK = 1e-6
-"""Share of a bin by which rounding may move a cell's edge."""
+"""Fraction of a bin by which rounding may move a cell's edge."""
 SIZE = 320
 """Width and height on the page, CSS pixels; the picture is twice as fine."""
 RING_DEG = 30.0
-"""Between two circles of equal θ."""
+"""Degrees between two circles of equal θ."""
 INK = 0.45
 """Opacity of circles and axes."""
 
 
 class Sectors(NamedTuple):
-    """n cells and what they are."""
+    """n cells of directions: their edges and rows of the legend."""
 
     theta: Floats  # shape (n, 2), lowest and highest, rad
     beta: Floats  # shape (n, 2), lowest and highest, rad; from 0 on, at most a turn wide
@@ -51,7 +51,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class PolarMap:
-    """A map with its legend: what a notebook shows, and a file."""
+    """A map with its legend, for a notebook or a file."""
 
     png: bytes  # the picture; no bytes where nothing is mapped
     under: str  # below it, HTML: what is drawn, and a line for each verdict that occurs
@@ -102,11 +102,11 @@ def _drawn(bins: Ints, legend: Sequence[Entry], rim: float) -> Pixels:
     x, y = np.meshgrid(side, -side)
     radius, (rings, around) = np.hypot(x, y), bins.shape
     ring = np.minimum((radius * rings).astype(np.int64), rings - 1)
-    turn = (np.mod(np.arctan2(y, x), 2 * np.pi) / (2 * np.pi) * around).astype(np.int64) % around
+    sector = (np.mod(np.arctan2(y, x), 2 * np.pi) / (2 * np.pi) * around).astype(np.int64) % around
     colours = np.array([*(entry.colour for entry in legend), (255, 255, 255)], dtype=np.uint8)
-    picture = colours[np.where(radius <= 1.0, bins[ring, turn], -1)]
-    beside = np.abs(radius[..., None] - np.append(np.arange(0.0, np.degrees(rim), RING_DEG) / np.degrees(rim), 1.0))
-    lined = (beside.min(axis=-1) < 0.5 / SIZE) | ((radius < 1.0) & (np.minimum(np.abs(x), np.abs(y)) < 0.5 / SIZE))
+    picture = colours[np.where(radius <= 1.0, bins[ring, sector], -1)]
+    line_gap = np.abs(radius[..., None] - np.append(np.arange(0.0, np.degrees(rim), RING_DEG) / np.degrees(rim), 1.0))
+    lined = (line_gap.min(axis=-1) < 0.5 / SIZE) | ((radius < 1.0) & (np.minimum(np.abs(x), np.abs(y)) < 0.5 / SIZE))
     picture[lined] = np.round(picture[lined] * (1.0 - INK))
     return np.asarray(picture)
 
@@ -120,8 +120,8 @@ def _painted(cells: Sectors, rim: float, size: float) -> Ints:
     b_first, b_last = _touched(cells.beta / (2 * np.pi) * around)
     for row in np.argsort(cells.code, kind="stable"):
         ring = slice(t_first[row], min(t_last[row], rings))
-        turn = np.arange(b_first[row], min(b_last[row], b_first[row] + around)) % around
-        bins[ring, turn] = cells.code[row]
+        sectors = np.arange(b_first[row], min(b_last[row], b_first[row] + around)) % around
+        bins[ring, sectors] = cells.code[row]
     return bins
 
 

@@ -1,4 +1,4 @@
-"""How far a piece of work is, told to whoever shows it, and how long its stages took. The planner never prints.
+"""Progress of work, reported to whoever shows it, and the time of its stages. The planner never prints.
 
 Who embeds it hears of stages (INFO), of what each is at (DEBUG) and of a case's warnings by the logger `LOG`.
 """
@@ -14,44 +14,44 @@ LOG = logging.getLogger("puncture_twin")
 LOG.addHandler(logging.NullHandler())  # nothing is printed unless a program says where
 
 Count = Callable[[int, int], None]
-"""Called with (done, to do), as often as something is done."""
+"""Callback with (done, to do), called as often as something is done."""
 Names = Callable[[str], None]
-"""Called with the name of each thing as it is come to."""
+"""Callback with the name of each item when it begins."""
 
 
 def unnamed(name: str) -> None:
-    """A `Names` that tells nobody."""
+    """A `Names` that does nothing."""
 
 
 def uncounted(done: int, total: int) -> None:
-    """A `Count` that tells nobody."""
+    """A `Count` that does nothing."""
 
 
 class Watcher(Protocol):
-    """Whoever shows progress."""
+    """Interface of whatever shows progress."""
 
     def step(self, stage: str, what: str) -> None:
-        """A stage has come to a named thing."""
+        """Report that a stage has reached a named item."""
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
-        """A stage has done so many of so many, and so many of these have failed."""
+        """Report how many items of a stage are done, of how many, and how many failed."""
 
     def note(self, line: str) -> None:
-        """Something happened that whoever watches should know."""
+        """Report an event that a person should know of."""
 
 
 class Silent:
-    """Shows nothing, and logs what happens."""
+    """A watcher that shows nothing and logs what happens."""
 
     def step(self, stage: str, what: str) -> None:
-        """Log it for who looks closely."""
+        """Log the step at the level of details."""
         LOG.debug("%s: %s", stage, what)
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
-        """Nothing: it may be called a thousand times."""
+        """Ignore the count: it may be reported a thousand times."""
 
     def note(self, line: str) -> None:
-        """Log it."""
+        """Log the event."""
         LOG.info(line)
 
 

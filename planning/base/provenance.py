@@ -20,7 +20,7 @@ from puncture_twin.planning.base.strict_json import text
 CASE_ROLE = "case"
 """The file that names the others; what it is called decides nothing."""
 KEPT_BYTES = 10_000_000
-"""So much in all stays in memory with its case, the smallest files first: points and names. Volumes, and the many
+"""Bytes of inputs that stay in memory with a case, the smallest files first: points and names. Volumes, and the many
 slices of a series, are let go of once parsed."""
 
 
@@ -65,7 +65,7 @@ def _place(one: Input) -> tuple[str, str]:
 
 
 def content_input(role: str, name: str, content: bytes) -> Input:
-    """The input that these bytes are."""
+    """The input of a role and path, with the hash of these bytes."""
     return Input(role, name, hashlib.sha256(content).hexdigest())
 
 
@@ -79,7 +79,7 @@ class InputFiles:
         self._known: dict[str, str] = {}
 
     def again(self) -> InputFiles:
-        """The same files to be read for another result: those that have changed since are refused."""
+        """A copy that reads the same files for another result: those that have changed since are refused."""
         files = InputFiles(self._folder)
         files._held, files._known = dict(self._held), {one.path: one.sha256 for one in self.inputs if one.path}
         return files
@@ -98,11 +98,11 @@ class InputFiles:
         return content
 
     def take(self, other: InputFiles, *, but: Sequence[str]) -> None:
-        """List what another result was made from, without reading it again, but for some roles."""
+        """List the inputs of another result without reading them again, but for some roles."""
         self._inputs |= {key: one for key, one in other._inputs.items() if key[0] not in (CASE_ROLE, *but)}
 
     def state(self, role: str, content: bytes) -> None:
-        """List bytes that come from no file; no name of a file leads to them."""
+        """List bytes as an input that comes from no file."""
         self._inputs[role, ""] = content_input(role, "", content)
 
     def read(self, role: str, name: str, *, max_bytes: int, key: str, where: Path) -> bytes:
@@ -142,14 +142,14 @@ class InputFiles:
         return next(one.sha256 for one in self._inputs.values() if one.path == name)
 
     def release(self) -> None:
-        """Let go of all but the smallest files; every hash stays."""
-        kept, total = {}, 0
+        """Release the bytes of all but the smallest files; every hash stays."""
+        small, total = {}, 0
         for name, content in sorted(self._held.items(), key=lambda one: len(one[1])):
             total += len(content)
             if total <= KEPT_BYTES:
-                kept[name] = content
-        self._held = kept
+                small[name] = content
+        self._held = small
 
     def __getstate__(self) -> dict[str, Any]:
-        """Another process is not sent gigabytes: it reads what it needs, and holds that against the hash."""
+        """For pickling: the state without bytes; another process reads what it needs, checked by its hash."""
         return {**self.__dict__, "_held": {}}

@@ -1,4 +1,4 @@
-"""Why a candidate is rejected: the reason codes of the candidates table, and how a person sees them.
+"""Reason codes of rejected candidates, as the candidates table has them, with their texts and colours.
 
 The colours follow Okabe and Ito's palette for colour-blind readers ("Color Universal Design", 2008), filled up with
 three dark tones of Paul Tol's ("Colour Schemes", SRON technical note, 2021); none of them is near the greens that mean
@@ -31,9 +31,9 @@ class Reason(StrEnum):
 
 Rgb = tuple[int, int, int]
 SAFE: Rgb = (0, 158, 115)
-"""Safe, where no shade is meant: legends, the corridor in 3D."""
+"""Colour of safe directions where no shade is meant: legends, the corridor in 3D."""
 UNSEEN_AIR: Rgb = (190, 190, 196)
-"""An unknown region outside of the body; one within it is darker, as `REASON_COLOURS` has it."""
+"""Colour of an unknown region outside of the body; one within it is darker, as `REASON_COLOURS` has it."""
 UNSEEN_AIR_TEXT = "unknown outside the body (image ends, or no air)"
 NOT_SEARCHED_TEXT = "outside the grid, not searched"
 _SHOWN: dict[Reason, tuple[Rgb, str]] = {

@@ -1,4 +1,4 @@
-"""JSON that decides something, read strictly: what the standard library lets pass is refused here.
+"""Strict JSON reader for documents that decide a result: what the standard library lets pass is refused.
 
 A key that stands twice has two meanings, of which a reader sees one; NaN and infinity are no JSON; 1e999 is infinite.
 The readers of single values raise what `fitting` turns into one line about the file.
@@ -19,7 +19,7 @@ from puncture_twin.planning.base.files import read_input
 
 Value = TypeVar("Value")
 MAX_NUMBER = 1e6
-"""Of millimetres, degrees, radians and seconds: products of larger ones overflow."""
+"""Largest number of millimetres, degrees, radians and seconds: products of larger ones overflow."""
 SHOWN = 60
 """Characters of a damaged value that an error shows."""
 
@@ -47,7 +47,7 @@ def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str
 
 @contextmanager
 def fitting(where: str | Path, allowed: str) -> Iterator[None]:
-    """One InputError for a key that is missing within, or a value of another type, shape or size."""
+    """Context with one InputError for a missing key, or a value of another type, shape or size."""
     try:
         yield
     except KeyError as error:
@@ -71,14 +71,14 @@ def field(document: dict[str, Any], name: str, read: Callable[[Any], Value]) -> 
 
 
 def text(value: Any) -> str:
-    """A text, and nothing that only prints as one. Raises TypeError: something else."""
+    """The value if it is a string. Raises TypeError: something else."""
     if not isinstance(value, str):
         raise TypeError(f"{_shown(value)} is not a text")
     return value
 
 
 def whole(value: Any) -> int:
-    """A whole number, written as one. Raises TypeError: something else."""
+    """The value if it is an integer. Raises TypeError: something else."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"{_shown(value)} is not a whole number")
     return value
@@ -103,19 +103,19 @@ def array(value: Any, shape: tuple[int, ...]) -> Floats:
     if not _numbers_only(value):
         raise ValueError("an array with values other than numbers")
     try:
-        found = np.array(value, dtype=np.float64)
+        numbers = np.array(value, dtype=np.float64)
     except OverflowError as error:
         raise ValueError(f"a number beyond {MAX_NUMBER:,.0f}") from error
-    if found.shape != shape:
-        raise ValueError(f"an array of shape {found.shape} instead of {shape}")
-    if not np.all(np.abs(found) <= MAX_NUMBER):
+    if numbers.shape != shape:
+        raise ValueError(f"an array of shape {numbers.shape} instead of {shape}")
+    if not np.all(np.abs(numbers) <= MAX_NUMBER):
         raise ValueError(f"a number beyond {MAX_NUMBER:,.0f}")
-    found.setflags(write=False)
-    return found
+    numbers.setflags(write=False)
+    return numbers
 
 
 def point(value: Any) -> Floats:
-    """Three numbers, as `array` takes them."""
+    """A point, shape (3,), as `array` takes it."""
     return array(value, (3,))
 
 
@@ -164,11 +164,11 @@ def _finite(written: str) -> float:
 
 
 def _unique_keys(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    document = dict(pairs)
+    if len(document) < len(pairs):
         keys = [key for key, _ in pairs]
         raise ValueError(f"key {_shown(next(key for key in keys if keys.count(key) > 1))} appears twice")
-    return found
+    return document
 
 
 def _numbers_only(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Names from files as a terminal, a page and a table may be given them, and the known one that was likely meant.
+"""Checked names for terminal, page and table, the known name that was likely meant, and values in a notebook.
 
 How a value shows itself: one line for ``print`` and a prompt, a piece of HTML for a notebook; neither ever raises.
 """
@@ -89,7 +89,7 @@ def brief(describe: Callable[[Value], str]) -> Callable[[Value], str]:
 
 
 LEAST_ALIKE = 0.6
-"""Of two names, by difflib's ratio, without capitals."""
+"""Least likeness of two names, by difflib's ratio, without capitals."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -159,9 +159,9 @@ class Shown:
 
 
 SHORT = 40
-"""Characters of a fact that stands in the one line."""
+"""Most characters of a fact in the one line of ``repr``."""
 UNITS = (("_mm", "mm"), ("_cm2", "cm²"), ("_deg", "°"), ("_s", "s"), ("_n", "N"))
-"""Endings of names, and the unit that they say."""
+"""Endings of names, and the units that they stand for."""
 
 
 def _plain(value: object) -> str | None:

@@ -1,4 +1,4 @@
-"""TOML files of a stated schema: found, bounded, read and validated, with one line for whatever is wrong."""
+"""Strict reader of TOML files with a schema: bounded, validated, and one line for whatever is wrong."""
 
 import re
 import tomllib
@@ -12,10 +12,10 @@ from puncture_twin.planning.base.errors import InputError, SchemaError, refuse, 
 from puncture_twin.planning.base.files import read_input
 
 MAX_BYTES = 1_000_000
-"""Such a file is written by hand; a larger one is something else."""
+"""Most bytes of a file: it is written by hand, and a larger one is something else."""
 Model = TypeVar("Model", bound=BaseModel)
 MAX_DEPTH = 20
-"""Brackets inside brackets; a case has four."""
+"""Most brackets inside brackets; a case has four."""
 MAX_KEY_PARTS = 8
 """Parts of a dotted key or table name; a case has three."""
 MAX_WORD = 100
@@ -39,13 +39,13 @@ def _one(value: object) -> object:
 
 
 CODES = {"extra_forbidden": "unknown_key", "missing": "missing_key"}
-"""What is wrong with a key, by Pydantic's word; any other is ``bad_value``."""
+"""Error code of each of Pydantic's faults of a key; any other is ``bad_value``."""
 SchemaOne = Annotated[int, BeforeValidator(_one)]
 """The key ``schema``: 1."""
 
 
 def find_toml(path: Path | str, usual_name: str) -> Path:
-    """The file itself, also of a folder that holds one of the usual name. Raises InputError: no plain file, or name."""
+    """The path of a file, or of the one of the usual name in a folder. Raises InputError: no plain file, or name."""
     path = Path(path)
     allowed = f"a TOML file, or a folder that holds {usual_name}"
     try:
@@ -59,7 +59,7 @@ def find_toml(path: Path | str, usual_name: str) -> Path:
 
 
 def read_toml_bytes(path: Path, allowed: str) -> bytes:
-    """The bytes of such a file. Raises InputError: unreadable, or too large."""
+    """The bytes of a TOML file. Raises InputError: unreadable, or too large."""
     return read_input(path, max_bytes=MAX_BYTES, where=str(path), allowed=allowed)
 
 
@@ -72,7 +72,7 @@ def parse_toml(
     keys: str,
     change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Model:
-    """Validate the bytes of such a file, after ``change`` stated some values otherwise; it is not opened again.
+    """The validated document of a TOML file's bytes, after ``change`` restated some values; it is not opened again.
 
     Raises InputError: not TOML, or not of the schema: names the first key that is wrong.
     """
@@ -97,7 +97,7 @@ def parse_toml(
 
 
 def _place(data: Any, keys: tuple[str | int, ...]) -> str:
-    """A key as who reads the file finds it: entries of a list are counted from 1, and named where they have a name."""
+    """A key as one finds it in the file: entries of a list are counted from 1, and named where they have a name."""
     said = ""
     for key in keys:
         try:

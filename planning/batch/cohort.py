@@ -72,7 +72,7 @@ def _folder_cases(cohort: Path) -> list[CohortCase]:
 
     What cannot be read, or a link to nothing next to folders, is refused: a patient would be lost.
     """
-    found, seen = [], set[str]()
+    cases, seen = [], set[str]()
     for folder, below, files in os.walk(cohort, followlinks=True, onerror=_refuse_unreadable):
         real = os.path.realpath(folder)
         if real in seen:
@@ -82,10 +82,10 @@ def _folder_cases(cohort: Path) -> list[CohortCase]:
         below.sort()
         if CASE_FILE in files:
             path = Path(folder) / CASE_FILE
-            found.append(CohortCase(path.relative_to(cohort).as_posix(), path))
+            cases.append(CohortCase(path.relative_to(cohort).as_posix(), path))
         elif below and (lost := [one for one in files if not (Path(folder) / one).exists()]):
             refuse(f"'{one_line(lost[0], 100)}' is a broken link", folder, READABLE, "cohort_not_whole")
-    return sorted(found, key=lambda one: one.stated)
+    return sorted(cases, key=lambda one: one.stated)
 
 
 def _refuse_unreadable(error: OSError) -> NoReturn:
@@ -192,9 +192,9 @@ class CohortFile(Section):
 def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a cohort file describes: every match of its patterns with every combination of its options."""
     stated = parse_toml(content, path, CohortFile, allowed=ALLOWED_TOML, keys=KEYS)
-    found = _matches(stated.cases, path)
+    paths = _matches(stated.cases, path)
     axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]
-    count = len(found) * math.prod(len(axis) for axis in axes)
+    count = len(paths) * math.prod(len(axis) for axis in axes)
     if count > MOST_CASES:
         refuse(f"gives {count} cases", path, f"at most {MOST_CASES}", "cohort_size")
     combinations = []
@@ -202,18 +202,18 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
         name = ", ".join(f"{kind} {name}" for kind, name, _ in choices)
         options = case_options({kind: dict(values) for kind, _, values in choices}, where=str(path))
         combinations.append((name, options))
-    return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
+    return [CohortCase(one, path.parent / one, name, options) for one in paths for name, options in combinations]
 
 
 def _matches(patterns: Sequence[str], path: Path) -> list[str]:
     """Matches of the patterns, each once, in the order of the patterns."""
-    found: dict[str, None] = {}
+    paths: dict[str, None] = {}
     for pattern in patterns:
         matches = sorted(glob.glob(pattern, root_dir=path.parent, recursive=True))  # noqa: PTH207  # absolute ones too
         if not matches:
             refuse(f"cases '{pattern}' matches nothing", path, "patterns of existing cases", "no_match")
-        found |= dict.fromkeys(matches)
-    return list(found)
+        paths |= dict.fromkeys(matches)
+    return list(paths)
 
 
 def _axis(stated: Any, axis: str, kind: str, path: Path) -> list[tuple[str, str, Mapping[str, Any]]]:

@@ -32,9 +32,9 @@ def merged_rows(cases: Sequence[PlannedCase], out: Path) -> list[dict[str, Any]]
     """A row for each case of the plan, in its order; one that has none yet says so."""
     rows = []
     for one in cases:
-        found = read_row(out, one.id)
+        row = read_row(out, one.id)
         blank = blank_row(one, None, NOT_RUN) | {"directions": None, "safe": None}
-        known = found and {name: found.get(name) for name in SCHEMA.names} | {"case": one.case, "name": one.name}
+        known = row and {name: row.get(name) for name in SCHEMA.names} | {"case": one.case, "name": one.name}
         rows.append(known or blank)
     return rows
 
@@ -60,7 +60,7 @@ def write_dataset(rows: Sequence[dict[str, Any]], out: Path, folder: Path, progr
 
 
 def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
-    """Every column of any, in the order of their first tables; one of two types is refused."""
+    """All columns of several tables, in the order of their first table; a column of two types is refused."""
     fields: dict[str, pa.Field] = {}
     for schema in schemas:
         for one in schema:
@@ -185,7 +185,7 @@ class Comparison:
 
     @property
     def counts(self) -> Counter[str]:
-        """Kind of change to how many."""
+        """Number of cases by kind of change."""
         return Counter(one.kind for one in self.changes)
 
     @property
@@ -195,13 +195,13 @@ class Comparison:
 
     def beyond(self, tolerance_mm: float) -> list[CaseChange]:
         """The cases whose verdict changed, or whose best clearance did by more than so much."""
-        found = []
+        changed = []
         for one in self.changes:
             clearances = [row["best_clearance_mm"] for row in (one.before, one.after) if row is not None]
             alike = one.clearance_mm is None or abs(one.clearance_mm) <= tolerance_mm
             if one.kind != "same" or clearances.count(None) == 1 or not alike:
-                found.append(one)
-        return found
+                changed.append(one)
+        return changed
 
 
 def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> Comparison:
@@ -234,9 +234,9 @@ def has_safe(row: Mapping[str, Any]) -> bool:
 
 def _keyed(rows: Iterable[Mapping[str, Any]]) -> dict[CaseKey, Mapping[str, Any]]:
     seen: Counter[tuple[str, str]] = Counter()
-    found = {}
+    by_key = {}
     for row in rows:
         key = (str(row["case"]), str(row["options"]))
-        found[(*key, seen[key])] = row
+        by_key[(*key, seen[key])] = row
         seen[key] += 1
-    return found
+    return by_key

@@ -102,8 +102,8 @@ def identified(row: PlannedCase) -> PlannedCase:
             path = find_toml(row.path, "case.toml")
             inputs = (content_input(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE)),)
     stated = json.dumps(inputs_document(inputs))
-    found = replace(row, id=case_id(row.options, row.arm, inputs, refusal), inputs=stated, refusal=refusal)
-    return found if row.id else replace(found, name=called)
+    updated = replace(row, id=case_id(row.options, row.arm, inputs, refusal), inputs=stated, refusal=refusal)
+    return updated if row.id else replace(updated, name=called)
 
 
 def relative_text(text: str, row: PlannedCase) -> str:
@@ -126,12 +126,12 @@ def read_plan_table(out: Path) -> Plan:
     path = out / PLAN_NAME
     if not path.is_file():
         refuse("has no plan", out, NO_PLAN, "no_batch_plan")
-    found = read_output(path, max_bytes=MAX_PLAN_BYTES)
+    output = read_output(path, max_bytes=MAX_PLAN_BYTES)
     try:
-        table = pq.read_table(io.BytesIO(found.data))
+        table = pq.read_table(io.BytesIO(output.data))
         rows: list[dict[str, Any]] = table.to_pylist()
         made_by = (table.schema.metadata or {})[b"version"].decode()
-        return Plan(tuple(PlannedCase(**row) for row in rows), found.sha256, made_by)
+        return Plan(tuple(PlannedCase(**row) for row in rows), output.sha256, made_by)
     except (pa.ArrowException, TypeError, KeyError, OSError) as error:
         what = f"is not a plan ({one_line(str(error), 100)})"
         raise InputError(what, where=path, allowed=NO_PLAN, code="not_parquet") from error
@@ -139,7 +139,7 @@ def read_plan_table(out: Path) -> Plan:
 
 ROW_NAME, TABLE_NAME, PAGE_NAME = "row.json", "candidates.parquet", "report.html"
 ENTRY = "batch"
-"""Of a result's manifest."""
+"""Name of the entry of a result's manifest."""
 MAX_ROW_BYTES = 1_000_000
 PROGRAM_FAILED = 3
 """The exit code of a case at which the program, not the case, failed: the next run tries it again."""
@@ -150,7 +150,7 @@ WORK_PREFIX = ".puncture-twin-cases-"
 
 
 def new_draft(work: Path, case_id: str) -> Path:
-    """A folder for the files of a result."""
+    """A new folder for the files of a result."""
     return Path(tempfile.mkdtemp(prefix=f"{case_id[:8]}-{os.getpid()}-", dir=work))
 
 
@@ -195,7 +195,7 @@ def write_row(row: Mapping[str, Any], draft: Path) -> None:
 
 
 def is_final(row: Mapping[str, Any] | None) -> bool:
-    """Whether a case need not be run again."""
+    """Whether a case has a final result and need not run again."""
     return row is not None and row["exit_code"] != PROGRAM_FAILED
 
 

@@ -33,7 +33,7 @@ from puncture_twin.planning.batch.run_case import NO_LIMITS, CaseEnd, CaseTask, 
 Item = TypeVar("Item")
 ALLOWED_PARTS = "i/n with 1 <= i <= n, such as 3/8"
 TASK, COUNT, FIRST, STEP = (f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "COUNT", "MIN", "STEP"))
-"""What SLURM tells each task of an array: https://slurm.schedmd.com/job_array.html."""
+"""Environment variables of each task of a SLURM array: https://slurm.schedmd.com/job_array.html."""
 
 
 class Part(NamedTuple):
@@ -58,10 +58,10 @@ WHOLE = Part(1, 1)
 
 def parse_part(text: str) -> Part:
     """A part as it is typed; anything else is refused."""
-    found = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
-    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+    match = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
         refuse(f"'{text[:40]}' is not a part", "--part", ALLOWED_PARTS, "bad_part")
-    return Part(int(found[1]), int(found[2]))
+    return Part(int(match[1]), int(match[2]))
 
 
 def slurm_part(environment: Mapping[str, str]) -> Part | None:
@@ -72,15 +72,15 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
     if not all(re.fullmatch(r"[0-9]{1,9}", value) for value in stated.values()):
         refuse(f"{stated} are not numbers", "SLURM's array", f"--part {ALLOWED_PARTS}", "bad_part")
     task, count, first, step = (int(stated[name]) for name in (TASK, COUNT, FIRST, STEP))
-    place, odd = divmod(task - first, max(step, 1))
-    if odd or not 0 <= place < count:
+    place, remainder = divmod(task - first, max(step, 1))
+    if remainder or not 0 <= place < count:
         what = f"task {task} of an array of {count} from {first} in steps of {step}"
         refuse(what, "SLURM's array", f"an array without gaps, or --part {ALLOWED_PARTS}", "bad_part")
     return Part(place + 1, count)
 
 
 RunTasks = Callable[[Sequence[CaseTask], Limits], Generator[CaseEnd, None, None]]
-"""Runs cases somewhere, and yields how each ended."""
+"""A function that runs cases somewhere, and yields how each ended."""
 LOCK_NAME = ".puncture-twin-run-lock"
 ALLOWED_AT_ONCE = "one run at a time, parallel parts (--part i/n), or another folder"
 
@@ -108,7 +108,7 @@ class RunCounts:
         return not (self.failed or self.refused_before)
 
     def add(self, end: CaseEnd) -> None:
-        """Count one more."""
+        """Count one more case."""
         if end.exit_code is None:
             self.stale += 1
             return
@@ -127,7 +127,7 @@ def run_cohort(
     write_page: WritePage | None = None,
     elsewhere: RunTasks | None = None,
 ) -> RunCounts:
-    """Run what has no final row yet.
+    """Run the cases of a plan that have no final row yet.
 
     Args:
         jobs: Processes of this machine, at most one a core.
@@ -209,7 +209,7 @@ def _locked(out: Path, name: str, kind: int) -> Iterator[None]:
 
 
 COPIES = 2
-"""Of each table: the case's own, and that of the merged dataset."""
+"""Copies of each table: the case's own, and that of the merged dataset."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,7 @@ class CohortState:
         return {**done, "failed": self.failed, "reasons": reasons, **rest}
 
     def add(self, planned: plans.PlannedCase, out: Path) -> None:
-        """Count one more; its files are read and hashed."""
+        """Count one more case; its files are read and hashed."""
         self.planned += 1
         row = plans.read_row(out, planned.id)
         if plans.identified(planned).id != planned.id:
@@ -305,7 +305,7 @@ def cohort_state(out: Path, progress: Count) -> CohortState:
 
 
 CONNECT_S, WORKER_CACHE = 20.0, "puncture_twin_kept"
-"""So long a scheduler may take to answer. Attribute of Dask's worker object: what this process keeps, and a lock."""
+"""Seconds that a scheduler may take to answer. Attribute of Dask's worker object: what it keeps, and a lock."""
 
 
 def on_scheduler(address: str) -> RunTasks:
@@ -357,6 +357,6 @@ def run_on_worker(task: CaseTask) -> CaseEnd:
     from distributed import get_worker
 
     fresh = Memory(MEMORY_BYTES), threading.Lock()
-    memory, turn = vars(get_worker()).setdefault(WORKER_CACHE, fresh)
-    with turn:
+    memory, lock = vars(get_worker()).setdefault(WORKER_CACHE, fresh)
+    with lock:
         return run_case(task, memory)

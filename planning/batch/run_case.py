@@ -161,7 +161,7 @@ def work(connection: Connection, memory_bytes: int) -> None:
 
 
 def _leave_with_parent() -> None:
-    """A worker without its main process would write on while the next run begins."""
+    """End this worker when its main process ends: it would write on while the next run begins."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
@@ -169,7 +169,7 @@ def _leave_with_parent() -> None:
 
 
 WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memory"
-"""Reasons of the rows that no worker could write."""
+"""Reasons of the rows of cases whose worker could not write one."""
 TRIES, LOOK_EVERY_S = 2, 0.2
 """Tries of a case whose worker dies; and seconds between two checks of memory and time."""
 STATM = "/proc/{}/statm"
@@ -274,8 +274,8 @@ def run_tasks(jobs: int, tasks: Iterable[CaseTask], limits: Limits) -> Generator
 def _started(task: CaseTask, limits: Limits) -> _Worker:
     """A new process that begins with a case as soon as its modules are loaded."""
     ours, theirs = SPAWN.Pipe()
-    kept = MEMORY_BYTES if limits.memory_mb is None else min(MEMORY_BYTES, limits.memory_mb * 1_000_000 // 4)
-    process = SPAWN.Process(target=work, args=(theirs, kept), daemon=True)
+    memory_bytes = MEMORY_BYTES if limits.memory_mb is None else min(MEMORY_BYTES, limits.memory_mb * 1_000_000 // 4)
+    process = SPAWN.Process(target=work, args=(theirs, memory_bytes), daemon=True)
     process.start()
     theirs.close()
     return _Worker(process, ours, task)

@@ -1,4 +1,4 @@
-"""A checked plan as a file for a robot: URScript, ROS 2, or a table of times. Metres: names with ``_m``.
+"""Exports: a checked plan for a robot, a case for Slicer, a result for an archive. Metres: names with ``_m``.
 
 What is written is read back and compared with the plan before it is published.
 """

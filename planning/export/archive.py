@@ -30,17 +30,17 @@ from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
 from puncture_twin.planning.geometry.rigid import apply
 
 DICOM = "dicom"
-"""The format's name."""
+"""Name of the format ``dicom``."""
 SEGMENTS, REPORT = "segments.dcm", "report.dcm"
 NAMES = (SEGMENTS, REPORT)
 MAKER = "puncture_twin"
 SCHEME = "99PUNCTURETWIN"
-"""Of the codes that no public scheme has."""
+"""Coding scheme of the codes that no public scheme has."""
 KINDS: Mapping[str, tuple[Code, Code]] = {
     "skin": (Code("91723000", "SCT", "Anatomical Structure"), Code("39937001", "SCT", "Skin structure")),
     "needle": (Code("49062001", "SCT", "Device"), Code("79068005", "SCT", "Needle, device")),
 }
-"""What a region is: category and type of its segment."""
+"""Category and type of the segment, by the kind of a region."""
 UNITS = {"mm": "mm", "deg": "deg", "mm2": "mm2", "deg2": "deg2", "s": "s", "": "1"}
 """Units of quantities, as UCUM writes them."""
 TYPE_2 = (
@@ -49,7 +49,7 @@ TYPE_2 = (
 )
 """A slice that leaves one of these out gives it as empty: DICOM allows both to be unknown."""
 WHOSE = ("PatientID", "PatientName", "PatientBirthDate", "StudyInstanceUID")
-"""What all slices must say alike."""
+"""Elements in which all slices must agree."""
 
 
 class Region(NamedTuple):
@@ -70,7 +70,7 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ArchiveContent:
-    """What is to be archived: lines of one or several points (n, 3), LPS mm, and sentences by their headings."""
+    """Content of the archive: lines of one or several points (n, 3), LPS mm, and sentences by their headings."""
 
     title: str
     regions: tuple[Region, ...]
@@ -136,7 +136,7 @@ def _mask(scan: CtSeries, region: Region) -> Bools:
 
 
 def finest_mm(scan: CtSeries) -> float:
-    """So near to each other are the points of a region that no voxel is missed between two of them."""
+    """Distance of a region's points, mm, at which no voxel between two of them is missed."""
     plane = scan.stack.plane
     return 0.4 * min(*plane.spacing_mm, float(np.linalg.norm(scan.stack.step_ct)))
 
@@ -164,7 +164,7 @@ def surface_points(points_ct: Floats, faces: Ints, step_mm: float) -> Floats:
 
 
 def _series(title: str, number: int) -> dict[str, Any]:
-    """What identifies an object: a new instance in a series of its own, since its date and time are new too."""
+    """Identifiers of an object: a new instance in a series of its own, since its date and time are new too."""
     own = version("puncture-twin")
     series = {"series_instance_uid": generate_uid(), "series_number": number, "series_description": title[:64]}
     instance = {"sop_instance_uid": generate_uid(), "instance_number": 1, "manufacturer": MAKER}
@@ -228,9 +228,9 @@ def _named(name: str) -> Code:
     return Code(hashlib.sha256(name.encode()).hexdigest()[:16], SCHEME, name[:64])
 
 
-def _bytes(made: Dataset) -> bytes:
+def _bytes(dataset: Dataset) -> bytes:
     stream = io.BytesIO()
-    made.save_as(stream, enforce_file_format=True)
+    dataset.save_as(stream, enforce_file_format=True)
     return stream.getvalue()
 
 
@@ -246,8 +246,8 @@ def _check_segments(data: bytes, scan: CtSeries, regions: Sequence[Region], mask
     T_stack_ct = np.linalg.inv(scan.stack.T_ct_index)
     for region, mask in zip(regions, masks, strict=True):
         volume = read[region.name].volume()
-        found = apply(T_stack_ct @ volume.T_ct_index, np.argwhere(volume.values > 0).astype(float))
-        if not np.array_equal(np.unique(np.rint(found).astype(int), axis=0), np.argwhere(mask)):
+        indices = apply(T_stack_ct @ volume.T_ct_index, np.argwhere(volume.values > 0).astype(float))
+        if not np.array_equal(np.unique(np.rint(indices).astype(int), axis=0), np.argwhere(mask)):
             raise RuntimeError(f"{SEGMENTS}: '{region.name}' does not read back as it was drawn")
 
 

@@ -1,4 +1,4 @@
-"""Export: written, read back, compared with the plan and the arm's limits, and only then published.
+"""Export of a plan: written, read back, compared with the plan and the arm's limits, and only then published.
 
 Other packages add formats by the entry point group `GROUP`; what they write is held to the same.
 """
@@ -32,7 +32,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_geometry
 
 GRID_MM = MAX_SWEEP_MM / 2.0
-"""In two directions: no state of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
+"""Grid of states: none of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
 LARGEST_BLEND_MM = 5.0
 """The first radius tried: enough not to stop, small against the space that a plan leaves."""
 SMALLEST_BLEND_MM = 1.0
@@ -41,7 +41,7 @@ LARGEST_FRACTION = 0.45
 """Fraction of each segment, so that two blends never overlap: the controller skips a waypoint whose blend overlaps the
 next."""
 SAMPLES = 400
-"""Along a segment, to find where the tip comes within the radius."""
+"""Samples along a segment, to find where the tip comes within the radius."""
 
 
 def blend_radii_mm(checker: CellChecker, waypoints: Floats) -> Floats:
@@ -80,9 +80,9 @@ def _triangle(checker: CellChecker, corner: Floats, back: Floats, ahead: Floats)
     """States of a triangle, (m, 6), in rays from its corner: neighbours on a ray or across are within ``GRID_MM``."""
     rays, steps = 1, 1
     while True:
-        turn = np.linspace(0.0, 1.0, rays + 1)[:, None, None]
+        fraction = np.linspace(0.0, 1.0, rays + 1)[:, None, None]
         along = np.linspace(0.0, 1.0, steps + 1)[None, :, None]
-        grid = corner + along * ((1.0 - turn) * back + turn * ahead)
+        grid = corner + along * ((1.0 - fraction) * back + fraction * ahead)
         outward = max(float(checker.sweep_mm(ray).max()) for ray in grid)
         across = max(float(checker.sweep_mm(arc).max()) for arc in grid.swapaxes(0, 1)[1:])
         if max(outward, across) <= GRID_MM:
@@ -129,7 +129,7 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Exported(Shown):
-    """A published file."""
+    """A published file of an export."""
 
     path: Path
     format_name: str
@@ -146,7 +146,7 @@ class _Draft(NamedTuple):
 def export_plan(
     plan: Plan, format_name: str, folder: Path, *, source: Path, checker: CellChecker | None = None
 ) -> Exported:
-    """Write a plan for a robot.
+    """The file of a plan for a robot, written and checked.
 
     Args:
         checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
@@ -195,13 +195,13 @@ class Exporter(NamedTuple):
     """How a plan is written in a format, and read back, to be held against the plan before it is published."""
 
     ending: str
-    """Of the file's name, such as ``.csv``."""
+    """Ending of the file's name, such as ``.csv``."""
     write: Callable[..., str]
     """``write(plan, case_checked=bool)``: an ASCII text."""
     read: Callable[..., SampledMotion]
     """``read(text, where=path)``: the motion that the text holds, as a robot would take it."""
     time_resolution_s: float = 0.0
-    """To which times are written."""
+    """Resolution to which times are written, s."""
     notes: tuple[str, ...] = ()
 
     def draft(self, plan: Plan, source: Path, checker: CellChecker | None) -> _Draft:
@@ -221,11 +221,11 @@ FORMATS: Mapping[str, tuple[str, Drafting]] = MappingProxyType(
 )
 """Format to the file name's end and who writes it."""
 GROUP = "puncture_twin.exporters"
-"""Of entry points: a format's name to an `Exporter`. None takes the place of a name in `FORMATS`."""
+"""Group of entry points: a format's name to an `Exporter`. None takes the place of a name in `FORMATS`."""
 
 
 def format_names() -> tuple[str, ...]:
-    """Those of `FORMATS`, and those that installed packages add."""
+    """Names of the formats of `FORMATS` and of those that installed packages add."""
     return (*FORMATS, *sorted(entry_points(group=GROUP).names - FORMATS.keys()))
 
 
@@ -237,10 +237,10 @@ def format_of(name: str) -> tuple[str, Drafting]:
         raise InputError(f"format '{name}'", where="export", allowed=", ".join(format_names()), code="unknown_format")
     entry = entry_points(group=GROUP)[name]
     try:
-        found: object = entry.load()
+        loaded: object = entry.load()
     except (ImportError, AttributeError) as error:
-        found = error
-    if isinstance(found, Exporter) and found.ending.startswith(".") and found.ending != ".json":
-        return found.ending, found.draft
+        loaded = error
+    if isinstance(loaded, Exporter) and loaded.ending.startswith(".") and loaded.ending != ".json":
+        return loaded.ending, loaded.draft
     where, allowed = f"{GROUP}: {entry.value}", "an Exporter with another file ending than a plan's"
-    raise InputError(f"format '{name}': {found!r}", where=where, allowed=allowed, code="no_exporter")
+    raise InputError(f"format '{name}': {loaded!r}", where=where, allowed=allowed, code="no_exporter")

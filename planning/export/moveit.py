@@ -66,7 +66,7 @@ def _object(name: str, frame: str) -> dict[str, Any]:
 PATH_TOLERANCE_RAD, GOAL_TOLERANCE_RAD = 0.02, 0.002
 """Beyond them the controller gives up: along the path 20 mm at a metre, at the end 2 mm."""
 GOAL_TIME_S = 1
-"""How much later than planned the arm may arrive."""
+"""Seconds later than planned that the arm may arrive."""
 
 
 def goal_messages(plan: Plan) -> dict[str, Any]:
@@ -149,9 +149,9 @@ def _json(document: object) -> str:
 
 M_PER_MM = 1e-3
 BOX, CYLINDER = 1, 3
-"""Of ``shape_msgs/SolidPrimitive``."""
+"""Types of ``shape_msgs/SolidPrimitive``."""
 GRAIN_M = 1e-6
-"""m to which coordinates are rounded."""
+"""Rounding of coordinates, m."""
 
 
 class RosFrames(NamedTuple):
@@ -164,7 +164,7 @@ class RosFrames(NamedTuple):
 
     @classmethod
     def of(cls, urdf: ArmUrdf) -> RosFrames:
-        """The frames of an arm."""
+        """The frames of an arm's URDF."""
         last = [member.link.name for member in urdf.chain.bodies[-1]]
         touching = dict.fromkeys((last[0], "flange", urdf.chain.flange, *last[1:]))
         T_root_base = np.asarray(np.linalg.inv(urdf.T_base_root), np.float64)

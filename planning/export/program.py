@@ -182,8 +182,8 @@ def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float
     """Refuse samples that are not the plan's, or that break a limit."""
     for name in SampledMotion._fields:
         read, planned = getattr(motion, name), getattr(plan, name)
-        same = read.q.shape == planned.q.shape and np.abs(read.q - planned.q).max() <= ANGLE_TOLERANCE_RAD
-        if not (same and np.abs(read.times_s - planned.times_s).max() <= TIME_TOLERANCE_S):
+        same_angles = read.q.shape == planned.q.shape and np.abs(read.q - planned.q).max() <= ANGLE_TOLERANCE_RAD
+        if not (same_angles and np.abs(read.times_s - planned.times_s).max() <= TIME_TOLERANCE_S):
             refuse(f"the {name} does not read back as in the plan", where, "the plan's samples", "not_read_back")
         check_trajectory(plan.model, read, time_resolution_s=time_resolution_s, what=name, where=where)
 
@@ -210,9 +210,9 @@ def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: 
     """Refuse speeds (m, 6), rad/s, and accelerations (k, 6), rad/s^2, above the limits; NaN is above."""
     most = np.full(6, model.max_acceleration)
     for rates, limits, unit in ((speeds, model.max_speeds, "rad/s"), (accelerations, most, "rad/s^2")):
-        kept = np.abs(rates) <= limits * (1.0 + RELATIVE_SLACK)
-        if not kept.all():
-            row, joint = np.argwhere(~kept)[0]
+        within = np.abs(rates) <= limits * (1.0 + RELATIVE_SLACK)
+        if not within.all():
+            row, joint = np.argwhere(~within)[0]
             at = f"{what}: {model.joint_names[joint]} at {abs(rates[row, joint]):.6g} {unit}"
             refuse(at, where, f"at most {limits[joint]:.6g} {unit}", "joint_too_fast")
 
@@ -251,14 +251,14 @@ def corner_rows(q: Floats) -> NDArray[np.intp]:
     Splits at the row farthest from the chord until none is off (Douglas and Peucker 1973, in six dimensions). For a
     path of straight segments that row is always one of its waypoints. Shape (k,), rising, of q (m, 6), rad.
     """
-    kept, pending = {0, len(q) - 1}, [(0, len(q) - 1)]
+    corners, pending = {0, len(q) - 1}, [(0, len(q) - 1)]
     while pending:
         first, last = pending.pop()
         split = _turning_row(q[first : last + 1])
         if split is not None:
-            kept.add(first + split)
+            corners.add(first + split)
             pending += [(first, first + split), (first + split, last)]
-    return np.array(sorted(kept), dtype=np.intp)
+    return np.array(sorted(corners), dtype=np.intp)
 
 
 def _turning_row(rows: Floats) -> int | None:
@@ -285,9 +285,9 @@ def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> 
 
 
 PLAIN = frozenset(string.ascii_letters + string.digits + " ._-+:/()")
-"""What may be in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
+"""Characters of a comment or a string in any of the formats: none that ends, escapes or nests one."""
 LONGEST = 200
-"""Characters of one name; a longer one is cut."""
+"""Most characters of a name; a longer one is cut."""
 
 
 def plain_text(text: str) -> str:
@@ -402,17 +402,17 @@ def _check_insertion(program: Program, plan: Plan, where: Path) -> None:
     angle = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
     if not angle <= TURN_TOLERANCE_RAD:
         refuse(f"the needle rotates by {angle:.3g} rad on its path", where, "a straight path", "not_straight")
-    moved = straight_move(model, program)
-    apart = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
+    straight = straight_move(model, program)
+    apart = np.abs(straight.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
     if not apart <= SAME_BRANCH_RAD:
         refuse(f"the straight move ends {apart:.3g} rad off", where, "the plan's own branch", "not_read_back")
     line = flange_pose(model, plan.insertion.q)[:, :3, 3]
     unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
-    away = np.concatenate([flange_pose(model, moved.q)[:, :3, 3], line]) - line[0]  # both, from one straight line
+    away = np.concatenate([flange_pose(model, straight.q)[:, :3, 3], line]) - line[0]  # both, from one straight line
     worst = float(np.linalg.norm(away - (away @ unit)[:, None] * unit, axis=1).max())
     if not worst <= STRAIGHT_TOLERANCE_MM:
         refuse(f"the straight move is {worst:.3g} mm off the planned path", where, "the plan", "not_straight")
-    check_trajectory(model, moved, time_resolution_s=0.0, what="insertion", where=where)
+    check_trajectory(model, straight, time_resolution_s=0.0, what="insertion", where=where)
 
 
 def _pose_difference(T_a: Floats, T_b: Floats) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from puncture_twin.planning.plan.plan import Plan
 
 NANOSECONDS = 1_000_000_000
 LONGEST_S = 2**31 - 1
-"""``sec`` is a signed 32-bit integer."""
+"""Longest time, s: ``sec`` is a signed 32-bit integer."""
 TIME_RESOLUTION_S = 1.0 / NANOSECONDS
 MONOTONE = 3.0
 """A cubic between two samples stays between them if its end slopes are at most this many times the chord's (Fritsch

@@ -50,7 +50,7 @@ _SHOWN = {
 
 
 class SceneNode(NamedTuple):
-    """One node of a scene, stored in a file next to it."""
+    """One node of a scene, stored in a file next to the scene."""
 
     kind: Kind
     name: str
@@ -88,7 +88,7 @@ def scene_references(text: str) -> tuple[set[str], set[str]]:
 
 
 SLICER = "slicer"
-"""The format's name."""
+"""Name of the format ``slicer``."""
 PATH, MARKERS, AREA = "path.mrk.json", "markers.mrk.json", "safe_entry.vtp"
 TRANSFORM, SCENE = "ct_to_robot.tfm", "scene.mrml"
 NAMES = (PATH, MARKERS, AREA, TRANSFORM, SCENE)
@@ -240,7 +240,7 @@ def area_vtp(area: EntryArea) -> str:
 
 
 def area_scalars(text: str) -> tuple[Ints, Floats]:
-    """Windows and safe cones of the points of such a file, as they were written."""
+    """Windows and safe cones of the points of an area's file, as they were written."""
     arrays = ElementTree.fromstring(text).findall("PolyData/Piece/PointData/DataArray")
     window, cone = ((one.text or "").split() for one in arrays)
     return np.array(window, dtype=np.int64), np.array(cone, dtype=np.float64)

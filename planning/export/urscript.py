@@ -23,7 +23,7 @@ from puncture_twin.planning.plan.plan import Plan
 
 M_PER_MM = 1e-3
 DIGITS = 12
-"""After the point: 1e-12 rad and 1e-9 mm. Never an exponent, which not every controller reads."""
+"""Digits after the point: 1e-12 rad and 1e-9 mm. Never an exponent, which not every controller reads."""
 START_TOLERANCE_RAD = 0.002
 """How far each joint may be from a planned one: 0.1 deg, 2 mm at a metre; a controller stops closer than that."""
 KINEMATICS_TOLERANCE_RAD = 0.02
@@ -34,7 +34,7 @@ STANDOFF_TOLERANCE_M = 0.002
 ALIGN_M_S = 0.005
 """Tip speed of the correction by that distance."""
 FIRST_WORDS = 90
-"""Characters of the first warning that the popup before the insertion shows."""
+"""Most characters of the first warning that the popup before the insertion shows."""
 _NUMBER = r"-?\d+\.\d+"
 _LIST = rf"\[{_NUMBER}(?:, {_NUMBER}){{5}}\]"
 _MOVEJ = re.compile(rf"  movej\(({_LIST}), a=({_NUMBER}), v=({_NUMBER}), r=({_NUMBER})\)")

@@ -16,7 +16,7 @@ from puncture_twin.planning.base.files import absence
 from puncture_twin.planning.base.output.manifest import is_output_folder
 
 FILE, FOLDER, HIDDEN = "", "is a folder", "is hidden"
-"""What most entries are; of all others it is said why they are neither."""
+"""Kinds of most entries; of all others it is stated why they are neither."""
 NOT_READ = "of an unsupported kind"
 HARMLESS = (
     *(".ds_store", "thumbs.db", "desktop.ini", ".directory", ".git*", ".datalad", ".dvc", ".dvcignore"),
@@ -60,7 +60,7 @@ class Entry(NamedTuple):
 
 
 def entries(folder: Path, *, most: int, allowed: str = "a readable folder") -> tuple[Entry, ...]:
-    """All in a folder, by name: also hidden files and dead links. Raises InputError: not to be listed, or too many."""
+    """Entries of a folder, by name: also hidden files and dead links. Raises InputError: unreadable, or too many."""
     try:
         with os.scandir(folder) as listed:
             found = sorted(Entry(one.name, _what(one)) for one in listed)
@@ -81,18 +81,18 @@ def _what(one: os.DirEntry[str]) -> str:
         return absence(Path(one.path))
 
 
-def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], bool], depth: int = 0) -> list[Entry]:
+def unaccounted(folder: Path, listed: tuple[Entry, ...], known: Callable[[Path], bool], depth: int = 0) -> list[Entry]:
     """The entries of a folder that are neither known (read, by whoever asks or someone else) nor harmless.
 
     A folder in it is accounted for if it is passed over, or if all that it holds is accounted for.
     """
-    names = {one.name for one in found}
+    names = {one.name for one in listed}
     return [
         one
-        for one in found
+        for one in listed
         if not known(folder / one.name)
         and not (one.what in (FILE, HIDDEN) and is_harmless(one.name, names))
-        and not (one.what == FOLDER and _holds_known(folder / one.name, known, depth + 1))
+        and not (one.what == FOLDER and _contains_known(folder / one.name, known, depth + 1))
     ]
 
 
@@ -118,7 +118,7 @@ def is_passed_over(folder: Path) -> bool:
     return versions or folder.name == THUMBNAILS or is_output_folder(folder)
 
 
-def _holds_known(folder: Path, known: Callable[[Path], bool], depth: int) -> bool:
+def _contains_known(folder: Path, known: Callable[[Path], bool], depth: int) -> bool:
     if is_passed_over(folder):
         return True
     if depth > MOST_DEPTH or STRUCTURE_LIKE.search(folder.name):

@@ -116,9 +116,9 @@ MAX_ROTATION_ENTRY = 1e3
 MIN_DIAGONAL_MM = 0.5
 """Smallest bounding box diagonal of a structure: less than any vessel. An organ in metres is below."""
 MAX_DIAGONAL_MM = 5_000.0
-"""Largest one: a body and its table fit. A body in mm that is declared as cm or m does not."""
-FIRST = 16
-"""Triangles that nearly always answer whether any has an area, without a kernel."""
+"""Largest diagonal: a body and its table fit. A body in mm that is declared as cm or m does not."""
+FIRST_TRIANGLES = 16
+"""First triangles, which nearly always answer whether any has an area, without a kernel."""
 MAX_TRIANGLES = 20_000_000
 """Fifty times our finest whole body; more would only exhaust the memory (1.4 GB of corner coordinates)."""
 _EXTENT_ALLOWED = (
@@ -153,7 +153,7 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
     if diagonal < MIN_DIAGONAL_MM:
         hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
         refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[:FIRST]], 1, 0)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[:FIRST_TRIANGLES]], 1, 0)
     if not (np.linalg.norm(np.cross(b - a, c - a), axis=1).any() or mesh.areas.any()):
         what = f"none of the {len(indices)} triangles has an area"
         refuse(what, where, "at least one triangle with an area", "no_area")
@@ -192,9 +192,9 @@ def _diagonal(points: NDArray[np.float64]) -> float:
 
 
 MAX_TOKEN_LENGTH = 64
-"""Longer than a double with all of its digits and exponent (24)."""
+"""Most characters of a token: longer than a double with all of its digits and exponent (24)."""
 MAX_VERTICES = 3 * MAX_TRIANGLES
-"""As many as the most triangles have corners."""
+"""Most vertices: as many as the most triangles have corners."""
 
 
 class RawMesh(NamedTuple):
@@ -234,8 +234,8 @@ def triangulate(
         refuse(f"{total} triangles", where, f"at most {MAX_TRIANGLES}", "too_many")
     start = np.repeat(np.cumsum(counts) - counts, counts - 2)
     step = np.arange(total) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    odd = step % 2
-    first, second = (start + step + odd, start + step + 1 - odd) if strips else (start, start + step + 1)
+    is_odd = step % 2
+    first, second = (start + step + is_odd, start + step + 1 - is_odd) if strips else (start, start + step + 1)
     return np.stack([corners[first], corners[second], corners[start + step + 2]], axis=1)
 
 

@@ -93,12 +93,12 @@ class CaseParts:
 
     @property
     def rows(self) -> list[Assigned]:
-        """All that the case says of structures."""
+        """The rows of all structures of the case."""
         return [row for _, rows in self.sources for row in rows]
 
 
 def case_text(parts: CaseParts) -> str:
-    """The whole file."""
+    """The text of the whole case file."""
     position = to_lps(parts.target_ct[None], parts.space)[0]
     own = OWN_TARGET.format(radius=parts.hit_radius_mm)
     head = HEAD.format(
@@ -122,10 +122,10 @@ def case_text(parts: CaseParts) -> str:
     errors = ERRORS.format(known=f"{max(off):.2f}" if off else "0.5", reason="; ".join(reasons))
     markers = ""
     for first in parts.markers[:1]:
-        same = (one.source for one in parts.markers[1:] if set(one.points.names) == set(first.points.names))
+        same_names = (one.source for one in parts.markers[1:] if set(one.points.names) == set(first.points.names))
         json = first.source.endswith(".json")
         own = "its file states the space" if json else f"read in {parts.space}, the case's space"
-        markers = REGISTRATION.format(ct=quoted(first.source), base=quoted(next(same, "touch.csv")), space=own)
+        markers = REGISTRATION.format(ct=quoted(first.source), base=quoted(next(same_names, "touch.csv")), space=own)
     gone = "".join(LEFT_OUT.format(file=quoted(one)) for one in parts.left_out)
     text = head + skin + gone + sections + markers + errors + END.format(count=count)
     return with_keys(text, parts.keys)
@@ -160,5 +160,5 @@ def with_image_seen(text: str, anatomy: Anatomy) -> str:
 
 
 def case_name(folder: str) -> str:
-    """A folder's name as a case may be called."""
+    """The name of a case, from its folder's."""
     return re.sub(r"[^\w.\-]+", "_", unicodedata.normalize("NFC", folder)).strip("_.-")[:80] or "case"

@@ -1,4 +1,4 @@
-"""What a folder holds for a case: CT, segmentations and lists of markers, told by content."""
+"""The CT, segmentations and lists of markers of a folder, recognised by content."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
-from puncture_twin.planning.base.arrays import counts_of
+from puncture_twin.planning.base.arrays import label_counts
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats import folder as folders
 from puncture_twin.planning.formats.dicom.recognise import list_folder
@@ -51,12 +51,12 @@ POINT_ENDINGS = (".csv", ".mrk.json", ".fcsv")
 MOST_ENTRIES = 5_000
 """Files and folders of a patient's folder; more are a disk, or a DICOM archive."""
 LEAST_MARKERS = 3
-"""Fewer register nothing."""
+"""Least points of a list of markers: fewer register nothing."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user says of the files."""
+    """What the user states of the files."""
 
     space: Space  # of meshes, and of lists that do not say theirs
     naming: str | None = None  # of label maps without names
@@ -91,8 +91,8 @@ class Markers:
 
 
 @dataclass(eq=False)
-class Found:
-    """What a folder holds."""
+class Contents:
+    """The contents of a folder: CTs, segmentations, markers, and what was not read."""
 
     cts: list[Ct] = field(default_factory=list)
     segmentations: list[Segmentation] = field(default_factory=list)
@@ -103,18 +103,18 @@ class Found:
     drawn: list[tuple[str, Kind]] = field(default_factory=list)
 
 
-def find(place: Place, wanted: Wanted) -> Found:
+def find(place: Place, wanted: Wanted) -> Contents:
     """Look through a folder and those below it, `DEPTH` deep. Raises InputError: one is unreadable, or no patient's."""
-    found = Found()
+    contents = Contents()
     for folder, listed, entered in _folders(place.folder, DEPTH):
-        _Looker(place, wanted, folder, listed, found).look(entered)
-    ct = found.cts[0].source if found.cts else None
-    for name, kind in found.drawn:
+        _Looker(place, wanted, folder, listed, contents).look(entered)
+    ct = contents.cts[0].source if contents.cts else None
+    for name, kind in contents.drawn:
         try:
-            found.segmentations.append(file_masks(place, name, DRAWN[kind], ct))
+            contents.segmentations.append(file_masks(place, name, DRAWN[kind], ct))
         except InputError as error:
-            found.problems.append(error)
-    return found
+            contents.problems.append(error)
+    return contents
 
 
 def _folders(folder: Path, depth: int) -> Iterator[tuple[Path, tuple[Entry, ...], frozenset[str]]]:
@@ -129,10 +129,10 @@ def _folders(folder: Path, depth: int) -> Iterator[tuple[Path, tuple[Entry, ...]
 
 
 class _Looker:
-    """Asks each kind's recogniser about one folder."""
+    """Sorts one folder's files into the contents, by each kind's recogniser."""
 
-    def __init__(self, place: Place, wanted: Wanted, folder: Path, listed: tuple[Entry, ...], found: Found) -> None:
-        self._place, self._wanted, self._found, self._folder, self._listed = place, wanted, found, folder, listed
+    def __init__(self, place: Place, wanted: Wanted, folder: Path, listed: tuple[Entry, ...], into: Contents) -> None:
+        self._place, self._wanted, self._into, self._folder, self._listed = place, wanted, into, folder, listed
         self._source = folder.relative_to(place.folder).as_posix()
         self._names = [self._name(one.name) for one in listed if one.what == FILE]
         self._read: set[str] = set()
@@ -143,31 +143,31 @@ class _Looker:
         return (PurePosixPath(self._source) / entry).as_posix()
 
     def look(self, entered: Collection[str]) -> None:
-        """DICOM, volumes, meshes, points; and what is none of these."""
+        """Sort the folder's DICOM, volumes, meshes and points, and what is none of these."""
         self._dicom()
         volumes = [name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)]
         meshes = [name for name in self._names if name.lower().endswith(MESH_SUFFIXES)]
         named = (self._name(one) for one in entered if not self._hollow(one))
         self._read.update(volumes, meshes, named, self._left_out)
-        self._found.passed += [(name, LEFT_OUT) for name in self._left_out]
+        self._into.passed += [(name, LEFT_OUT) for name in self._left_out]
         self._volumes(volumes)
         if meshes and not volumes:
             self._only = "meshes"
         wanted = self._wanted
         if taken := [name for name in meshes if wanted.takes("labels", name)]:
             with self._noting("FILE"):
-                found = mesh_folder(self._place, self._source, taken, wanted.space, wanted.unit, wanted.up)
-                self._found.segmentations.append(found)
+                segmentation = mesh_folder(self._place, self._source, taken, wanted.space, wanted.unit, wanted.up)
+                self._into.segmentations.append(segmentation)
         for name in self._names:
             if name.lower().endswith(POINT_ENDINGS):
                 try:
                     points = read_points(self._place.folder / name, default_space=wanted.space, default_unit=Unit.MM)
                 except InputError as error:
                     if not name.lower().endswith(".csv"):  # other tables are no lists of points, and no problem
-                        self._found.passed.append((name, error.what))
+                        self._into.passed.append((name, error.what))
                     continue
                 if len(points.names) >= LEAST_MARKERS:
-                    self._found.markers.append(Markers(name, points))
+                    self._into.markers.append(Markers(name, points))
         self._account()
 
     def _hollow(self, name: str) -> bool:
@@ -177,14 +177,14 @@ class _Looker:
         return bool(like) and not unaccounted(folder, entries(folder, most=MOST_ENTRIES), lambda _: False)
 
     def _account(self) -> None:
-        """What was not read: it is refused where it may be a structure, and else told."""
+        """Refuse what was not read where it may be a structure, and else note it."""
 
         def known(path: Path) -> bool:
             name = path.relative_to(self._place.folder).as_posix()
             table = not self._only and path.name.lower().endswith(NAME_ENDINGS)
             return name in self._read or (table and not STRUCTURE_LIKE.search(path.name))
 
-        images = {structure_name(one) for one in (*(ct.source for ct in self._found.cts), *dict(self._found.passed))}
+        images = {structure_name(one) for one in (*(ct.source for ct in self._into.cts), *dict(self._into.passed))}
         of_image = [one for one in self._listed if one.name.endswith(".npz") and one.name[:-4] in images]
         left = [*unaccounted(self._folder, self._listed, known), *of_image]  # nnU-Net's stand beside labels
         lost: dict[str, Entry] = {}
@@ -201,10 +201,10 @@ class _Looker:
         if lost:
             with self._noting(self._name(next(iter(lost)))):
                 raise not_read([*lost.values()], self._only or "files", self._folder)
-        self._found.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one.name not in lost]
+        self._into.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one.name not in lost]
 
     def _dicom(self) -> None:
-        """Each CT series of the folder: it is named by the folder, or where there are several by a file of each."""
+        """Add each CT series of the folder, named by the folder, or where there are several by a file of each."""
         try:
             files, _ = list_folder(self._folder)
             self._read.update(self._name(one.name) for one in files)
@@ -212,35 +212,35 @@ class _Looker:
             names = {uid: self._name(file) for uid, file in series.items()}
             for name in sorted(names.values()) if len(names) > 1 else [self._source][: len(names)]:
                 if self._wanted.takes("ct", name):
-                    self._found.cts.append(Ct(name, self._place.volume(name)))
+                    self._into.cts.append(Ct(name, self._place.volume(name)))
         except InputError as error:
-            self._found.problems.append(error)
+            self._into.problems.append(error)
             self._read.update(self._names)
             return
         for one in files:
             name = self._name(one.name)
             if one.kind in DRAWN and self._wanted.takes("labels", name):
-                self._found.drawn.append((name, one.kind))
+                self._into.drawn.append((name, one.kind))
         others = Counter(one.sop_class for one in files if one.kind not in {Kind.CT, *DRAWN})
-        self._found.passed += [(self._source, f"{count} {kind}") for kind, count in sorted(others.items())]
+        self._into.passed += [(self._source, f"{count} {kind}") for kind, count in sorted(others.items())]
 
     @contextmanager
     def _noting(self, name: str) -> Iterator[None]:
-        """What is refused within is a problem, one of all; a file can be left out."""
+        """Context in which a refusal becomes one of the problems; a file can be left out."""
         try:
             yield
         except InputError as error:
             error.allowed += f"; or --ignore {name}: its content then counts as free"
-            self._found.problems.append(error)
+            self._into.problems.append(error)
 
     def _volumes(self, names: Sequence[str]) -> None:
-        """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""
+        """Add CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""
         masks: list[Mask] = []
         empty: list[str] = []
         for name in names:
             with self._noting(name):
                 self._volume(name, masks, empty)
-        aside = {one.source for one in self._found.cts} | {name for name, _ in self._found.passed}
+        aside = {one.source for one in self._into.cts} | {name for name, _ in self._into.passed}
         only = len(set(names) - aside) == 1
         for mask in tuple(masks):
             with self._noting(mask.file):
@@ -255,14 +255,14 @@ class _Looker:
         alone = alone and not self._left_out
         self._only = "masks" if alone else ""
         said = () if alone or not empty else (f"empty masks: {', '.join(empty)}",)
-        self._found.segmentations.append(masks_of(self._place, self._source, masks, said, whole_folder=alone))
+        self._into.segmentations.append(masks_of(self._place, self._source, masks, said, whole_folder=alone))
 
     def _volume(self, name: str, masks: list[Mask], empty: list[str]) -> None:
         if not any(self._wanted.takes(kind, name) for kind in ("ct", "labels")):
             return
         if name.lower().endswith(SEGMENT_ENDING) and is_layered(self._place.content(name), self._place.folder / name):
             if self._wanted.takes("labels", name):
-                self._found.segmentations.append(file_masks(self._place, name, "seg", None))
+                self._into.segmentations.append(file_masks(self._place, name, "seg", None))
             return
         surfaces = self._place.volume(name)
         self._read.update(surfaces.source.files)
@@ -270,7 +270,7 @@ class _Looker:
         if kind != OTHER and not self._wanted.takes(kind, name):
             return
         if kind == "ct":
-            self._found.cts.append(Ct(name, surfaces))
+            self._into.cts.append(Ct(name, surfaces))
         elif kind == "labels" and surfaces.names is None and self._wanted.naming is None:
             labels = labelmap_of(surfaces.volume, may_be_empty=True)
             if len(labels.boxes) > 1:
@@ -286,10 +286,10 @@ class _Looker:
             if low >= -1 and high <= 1 and self._wanted.takes("labels", name):
                 what = f"values from {low:.3g} to {high:.3g} are neither a mask nor a CT"
                 refuse(what, self._place.folder / name, "0 and one other whole number in a mask", "not_a_mask")
-            self._found.passed.append((name, why))
+            self._into.passed.append((name, why))
 
     def _label_file(self, name: str, surfaces: VolumeSurfaces) -> None:
-        self._found.segmentations.append(label_file(self._place, name, surfaces, self._wanted.naming))
+        self._into.segmentations.append(label_file(self._place, name, surfaces, self._wanted.naming))
 
 
 def volume_kind(volume: Volume) -> tuple[str, str]:
@@ -306,7 +306,7 @@ def volume_kind(volume: Volume) -> tuple[str, str]:
         if error.code == "labels_blended":
             raise
         return OTHER, f"{error.what}, and for Hounsfield units nothing is below {AIR_HU}"
-    counts = counts_of(whole.T, round(high))  # as it lies in a file: the first index runs fastest
+    counts = label_counts(whole.T, round(high))  # as it lies in a file: the first index runs fastest
     different = np.count_nonzero(counts)
     if different > MOST_LABELS or (different > FEW_LABELS and _differs_everywhere(whole)):
         air = int(np.argmax(counts))

@@ -36,7 +36,7 @@ NUMBERING_UNSURE = (
 
 
 class Mask(NamedTuple):
-    """One mask that is not empty."""
+    """A mask that is not empty, with the box of its voxels."""
 
     file: str  # relative to the case's folder
     label: int
@@ -45,10 +45,10 @@ class Mask(NamedTuple):
 
 
 def masks_of(
-    place: Place, source: str, found: Sequence[Mask], notes: tuple[str, ...], *, whole_folder: bool
+    place: Place, source: str, listed: Sequence[Mask], notes: tuple[str, ...], *, whole_folder: bool
 ) -> Segmentation:
     """Masks of one folder, one file a structure; the case names the ``whole_folder`` where it holds nothing else."""
-    masks = dict(enumerate(found, start=1))
+    masks = dict(enumerate(listed, start=1))
 
     def single(row: Assigned) -> str:
         return label_text(row, masks[row.label].file, masks[row.label].label)
@@ -66,7 +66,7 @@ def masks_of(
         surface=lambda label: place.volume(masks[label].file).label(masks[label].label),
         skin=lambda label: place.volume(masks[label].file).imaged(masks[label].label).skin(),
         section=section,
-        voxel_ct=found[0].T_ct_index[:3, :3],
+        voxel_ct=listed[0].T_ct_index[:3, :3],
         notes=notes,
     )
 
@@ -92,7 +92,7 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
     """
     present = surfaces.present().labels
     if naming is None and surfaces.names is None:
-        naming, notes = _found_naming(place, source, surfaces.labelmap, present)
+        naming, notes = _naming(place, source, surfaces.labelmap, present)
     else:
         notes = ()
     named = names_for(naming, place.folder, lambda name: _table(place.folder / name), surfaces)
@@ -121,8 +121,8 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
     )
 
 
-def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence[int]) -> tuple[str, tuple[str, ...]]:
-    table, others = _one_table(place, source, present, _tables_beside(place.folder, source))
+def _naming(place: Place, source: str, labels: LabelMap, present: Sequence[int]) -> tuple[str, tuple[str, ...]]:
+    table, others = _full_table(place, source, present, _tables_near(place.folder, source))
     if table is not None:
         return table[0], (f"{source}: names from {table[0]}",)
     naming = likely_numbering(labels)
@@ -140,24 +140,24 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
     ``only``: whether no other map or mask lies beside it, so that the table may have any name. Raises InputError: it is
     one organ by the file's name, and another by a table of another name.
     """
-    tables = [one for one in _tables_beside(place.folder, source) if only or _is_named_like(one, source)]
-    table, _ = _one_table(place, source, [label], tables)
+    tables = [one for one in _tables_near(place.folder, source) if only or _is_named_like(one, source)]
+    table, _ = _full_table(place, source, [label], tables)
     name = structure_name(source)
     if table is None or name in table[1].values():
         return False
-    own, told = (default_role(one, "other") for one in (name, table[1][label]))
-    if own not in (None, told) and not _is_named_like(table[0], source):
+    own, tabled = (default_role(one, "other") for one in (name, table[1][label]))
+    if own not in (None, tabled) and not _is_named_like(table[0], source):
         what = f"is '{name}' by its own name, but '{table[1][label]}' by {table[0]}"
         allowed = "--naming with that table if it is right; otherwise move the table to another folder"
         refuse(what, place.folder / source, allowed, "label_named_twice")
     return True
 
 
-def _one_table(
+def _full_table(
     place: Place, source: str, present: Sequence[int], tables: Iterable[str]
 ) -> tuple[tuple[str, dict[int, str]] | None, list[str]]:
     """The table beside a map that names all of its labels: the one named like the map, else the only one."""
-    found, others = [], []
+    named, others = [], []
     for table in tables:
         try:
             names = parse_names(_table(place.folder / table), place.folder / table)
@@ -167,13 +167,13 @@ def _one_table(
         if missing := [label for label in present if label not in names]:
             others.append(f"{table} lacks {_ranges(missing)} (it names {_ranges(sorted(names))})")
         else:
-            found.append((table, names))
-    if not found or _is_named_like(found[0][0], source):
-        return (found[0] if found else None), others
-    if any([other[label] for label in present] != [found[0][1][label] for label in present] for _, other in found[1:]):
-        what = f"several tables name its labels differently: {', '.join(table for table, _ in found)}"
+            named.append((table, names))
+    if not named or _is_named_like(named[0][0], source):
+        return (named[0] if named else None), others
+    if any([other[label] for label in present] != [named[0][1][label] for label in present] for _, other in named[1:]):
+        what = f"several tables name its labels differently: {', '.join(table for table, _ in named)}"
         refuse(what, place.folder / source, "--naming with the right table", "several_namings")
-    return found[0], others
+    return named[0], others
 
 
 def _ranges(labels: Sequence[int]) -> str:
@@ -188,7 +188,7 @@ def _is_named_like(table: str, source: str) -> bool:
     return table.rpartition("/")[2].split(".")[0] == structure_name(source).split(".")[0]
 
 
-def _tables_beside(folder: Path, source: str) -> Iterator[str]:
+def _tables_near(folder: Path, source: str) -> Iterator[str]:
     """Files that may be tables of names, those first that are named like the map."""
     parent = (folder / source).parent
     files = [one.name for one in entries(parent, most=MAX_ENTRIES) if one.name.lower().endswith(NAME_ENDINGS)]
@@ -233,12 +233,12 @@ def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentat
 
 
 LEAST_RULES = 3
-"""With fewer that can be checked, chance decides."""
+"""Least rules that must be checked: with fewer, chance decides."""
 MOST_BROKEN, LEAST_BROKEN = 0.1, 0.15
 """Fractions of the rules: so few may be broken in the right naming (curved spines, moved organs), so many are in the
 wrong."""
 LEAST_WRONG = 2
-"""One rule alone may be broken by a patient."""
+"""Least broken rules of a wrong naming: one alone may be broken by a patient."""
 _SPINE = [f"vertebrae_{part}{n}" for part, last in (("C", 7), ("T", 12), ("L", 5)) for n in range(1, last + 1)]
 _RIBS = [[f"rib_{side}_{n}" for n in range(1, 13)] for side in ("left", "right")]
 FROM_HEAD = (
@@ -254,7 +254,7 @@ BESIDE_SPINE = (
     "kidney", "adrenal", "rib", "hip", "femur", "lung", "gluteus", "iliopsoas", "autochthon",
     "scapula", "humerus", "clavicula",
 )  # fmt: skip
-"""How names of structures begin of which each lies on its own side of the spine."""
+"""Beginnings of the names of structures that lie each on its own side of the spine."""
 
 
 def likely_numbering(labelmap: LabelMap) -> str | None:

@@ -1,4 +1,4 @@
-"""What a person states where `init` would guess or refuse: one option each, so that a refusal can name a way out."""
+"""Statements of a person where `init` would guess or refuse: one option each, which a refusal can name."""
 
 import json
 import re
@@ -31,7 +31,7 @@ STATED = "stated to init"
 
 @dataclass(frozen=True)
 class Overrides:
-    """What a person states."""
+    """The statements of a person: roles, files and keys."""
 
     skin: str | None = None  # the structure that is the skin, or None
     # name of a structure, or of a file, to ``ignore`` or ``unknown``

@@ -31,15 +31,15 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
 CASE_FILE = "case.toml"
-"""What the new case will be called."""
+"""File name of the new case."""
 STATED = DefaultRole("stated", (), "unknown", 0.0, "stated to init")
-"""Of a role that a person states."""
+"""Default role of a name whose role a person states."""
 HOLDS_TARGET = "it also contains the target, and its name is not known as an organ that a needle may cross"
-"""Why a structure is unknown."""
+"""Reason of the role ``unknown``."""
 
 
 class Assigned(NamedTuple):
-    """What the case says of one structure."""
+    """The role and margin of one structure in the case, with the reason."""
 
     label: int
     name: str
@@ -50,7 +50,7 @@ class Assigned(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Structures of one file or folder, whatever it is."""
+    """The structures of one file or folder of any kind."""
 
     source: str  # the file or folder, relative to the case's
     names: Mapping[int, str]  # label to name, of the structures that are there
@@ -70,7 +70,7 @@ def in_boxes(boxes: Mapping[int, Floats], point_ct: Floats) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Place:
-    """The folder of the case, where surfaces are kept, and who is told the name of each file that is read."""
+    """The folder of the case, the cache of its surfaces, and the callback with each file that is read."""
 
     folder: Path
     cache: Cache
@@ -115,7 +115,7 @@ def margin_line(row: Assigned) -> str:
 
 
 def structure_text(row: Assigned, source: str, more: str = "") -> str:
-    """The ``[[structure]]`` of one with a source of its own: lines that name that, and lines behind its margin."""
+    """The ``[[structure]]`` of one with a source of its own: the source's lines, then lines behind its margin."""
     head = f"[[structure]]\nname = {quoted(row.name)}\n{source}"
     return f'{head}role = "{row.kind}"\n{margin_line(row)}{more}'
 
@@ -200,8 +200,8 @@ def mesh_folder(
         ends = flat_ends(meshes()[row.label]) if row.kind == "skin" else ()
         listed = ", ".join(map(quoted, ends))
         cut = f"cut = [{listed}]  # flat there: the scan ended; [] if all of it is skin\n" if ends else ""
-        turned = "" if up is None else f'up = "{up}"\n'
-        return structure_text(row, f'mesh = {quoted(files[row.label])}\nunit = "{unit}"\n{turned}', cut)
+        up_line = "" if up is None else f'up = "{up}"\n'
+        return structure_text(row, f'mesh = {quoted(files[row.label])}\nunit = "{unit}"\n{up_line}', cut)
 
     return Segmentation(
         source,
@@ -218,16 +218,16 @@ NEAR_MM, NEAR = 8.0, 0.02
 """An outline follows the skin to 8 mm: the coarsest voxels in use are 6 mm wide. In a small body, such as an animal's,
 an organ is so near to it too: there to 2 % of the box's diagonal."""
 MOST_OF_SKIN = 0.7
-"""Of the skin, which a shell or the whole body covers; what covers it is crossed by every path."""
+"""Fraction of the skin that a shell or the whole body covers; what covers it is crossed by every path."""
 PART_OF_SKIN, MOST_OF_OUTLINE = 0.25, 0.6
 """A body that was cropped, or cut at its limbs, covers a part of the skin, and is bounded by it but for the cuts."""
 POINTS, PLACES = 4_000, 200_000
 """Points that are asked about, and places of the other surface that they are compared with: on 2 square metres these
 lie 3 mm apart, so that what is within 8 mm is found."""
 LEAST_HELD = 0.9
-"""Of the other structures, which the skin holds: a line or a bed may have been drawn too, and lies outside."""
+"""Fraction of the other structures that the skin contains: a line or bed may have been drawn too, and lies outside."""
 SLACK_MM = 2.0
-"""So far a structure may reach out of the skin's box: both were drawn."""
+"""How far a structure may reach out of the skin's box: both were drawn."""
 
 
 class Structure(NamedTuple):
@@ -238,12 +238,12 @@ class Structure(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As its segmentation calls it."""
+        """Its name in its segmentation."""
         return self.segmentation.names[self.label]
 
     @property
     def surface(self) -> TriangleMesh:
-        """Of it, LPS mm."""
+        """Its surface, LPS mm."""
         return self.segmentation.surface(self.label)
 
 
@@ -259,18 +259,18 @@ def skin_of(segmentations: Sequence[Segmentation], stated: str | None) -> Struct
     return max(named, key=lambda one: float(np.ptp(one.surface.bounds, axis=0).prod()), default=None)
 
 
-def skin_problems(found: Structure, segmentations: Sequence[Segmentation]) -> Iterator[str]:
+def skin_problems(candidate: Structure, segmentations: Sequence[Segmentation]) -> Iterator[str]:
     """Why what is named like the skin cannot be it: what lies outside of a skin counts as air beside the patient."""
-    boxes = [one.surface.bounds for one in structures_of(segmentations) if one != found]
-    low, high = found.surface.bounds
+    boxes = [one.surface.bounds for one in structures_of(segmentations) if one != candidate]
+    low, high = candidate.surface.bounds
     held = [bool(np.all((one[0] >= low - SLACK_MM) & (one[1] <= high + SLACK_MM))) for one in boxes]
     if sum(held) < LEAST_HELD * len(held):
-        noun = "meshes" if found.segmentation.voxel_ct is None else "structures"
-        yield f"'{found.name}' is named like the skin, but contains {sum(held)} of the {len(held)} other {noun}"
+        noun = "meshes" if candidate.segmentation.voxel_ct is None else "structures"
+        yield f"'{candidate.name}' is named like the skin, but contains {sum(held)} of the {len(held)} other {noun}"
 
 
 class Agreement(NamedTuple):
-    """How far a structure is the body's outline."""
+    """How well a structure agrees with the body's skin."""
 
     skin_covered: float  # of the skin, the fraction that it is near to; faces where the scan cut the body do not count
     on_skin: float  # of its own surface, the fraction that is near to the skin
@@ -278,7 +278,7 @@ class Agreement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """The structures that are named like the body, held against its skin."""
+    """The structures that are named like the body, compared with its skin."""
 
     segmentations: Sequence[Segmentation]
     skin: Skin
@@ -291,20 +291,20 @@ class Outlines:
 
     def at(self, point_ct: Floats) -> frozenset[str]:
         """The names of those that are outlines of the body, or of the part of it that holds a point (3,), LPS mm."""
-        found = set(self.stated)
+        names = set(self.stated)
         for name, (mesh, one) in self._named.items():
             part = one.skin_covered >= PART_OF_SKIN and one.on_skin >= MOST_OF_OUTLINE
             if one.skin_covered >= MOST_OF_SKIN or (part and side_of(mesh, point_ct) is Side.INSIDE):
-                found.add(name)
-        return frozenset(found)
+                names.add(name)
+        return frozenset(names)
 
     def notes(self, point_ct: Floats) -> Iterator[str]:
-        """What a person should know of those that are none, one sentence each."""
+        """A sentence for a person about each that is named like an outline and is none."""
         for name in sorted(self._named.keys() - self.at(point_ct)):
-            _, found = self._named[name]
+            _, fit = self._named[name]
             yield (
-                f"'{name}' is named like the outline of the body, but covers {found.skin_covered:.0%} of the skin, and "
-                f"{found.on_skin:.0%} of it is there: treated as an ordinary structure (if it is the outline: ignore)"
+                f"'{name}' is named like the outline of the body, but covers {fit.skin_covered:.0%} of the skin, and "
+                f"{fit.on_skin:.0%} of it is there: treated as an ordinary structure (if it is the outline: ignore)"
             )
 
 
@@ -336,21 +336,21 @@ round holds it: the target was carved out of it, and no path comes to it otherwi
 
 
 def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict[str, float]:
-    """Of the target's surface the fraction that each structure borders on whose box may go round it."""
+    """Fraction of the target's surface that each structure borders on whose box may go round it."""
     every = structures_of(segmentations)
-    found = {}
+    fractions = {}
     for own in (one for one in every if one.name == target):
         points = spread_on(own.surface, POINTS).points
         for one in (one for one in every if one.name != target):
             mesh = one.surface
             low, high = mesh.bounds
             if np.all((points >= low - BORDER_MM) & (points <= high + BORDER_MM), axis=1).mean() >= MOST_OF_BORDER:
-                found[one.name] = fraction_near(points, mesh, BORDER_MM)
-    return found
+                fractions[one.name] = fraction_near(points, mesh, BORDER_MM)
+    return fractions
 
 
 def carved_notes(rows: Sequence[Assigned], target: str | None, border: Mapping[str, float]) -> Iterator[str]:
-    """That an avoided structure goes round the target's, one sentence each."""
+    """A sentence about each avoided structure that goes round the target's."""
     for row in rows:
         if row.kind == "avoid" and border.get(row.name, 0.0) >= MOST_OF_BORDER:
             yield (

@@ -1,4 +1,4 @@
-"""A folder in, the text of a case out: what is found, whether it fits together, and what a person should look at."""
+"""The text of a new case from a folder: what is in it, whether it fits together, and what a person should check."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init import segmentation, target as targets
 from puncture_twin.planning.init.case_text import CaseParts, case_text
-from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
+from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Contents, Ct, Markers, Wanted, find
 from puncture_twin.planning.registration.fiducials import Stated, find_fiducials
 
 ALLOWED = (
@@ -30,7 +30,7 @@ ALLOWED = (
     "docs/how-to/your-own-ct.md"
 )
 SEEN = "markers_ct.csv"
-"""Where markers are listed that the CT shows."""
+"""File of the markers that the CT shows."""
 OUTSIDE_WAYS = "a point in the body, mm, in the space given by --space; or --skin NAME for another skin"
 PHANTOM = (
     'region = "phantom": no limbs are searched for, and of several connected objects the one with the target is the '
@@ -40,7 +40,7 @@ PHANTOM = (
 
 @dataclass(frozen=True)
 class Request:
-    """What the user wants."""
+    """A user's request for a new case."""
 
     folder: Path
     target: str | None  # ``X,Y,Z`` in mm, or None for ``target_label``
@@ -67,24 +67,24 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     """The text of a case with the files of a folder. Raises InputError: all that keeps it from being made, in one."""
     space, overrides = request.wanted.space, request.wanted.overrides
     point = None if request.target is None else targets.parse_point(request.target, space)
-    found = find(segmentation.Place(request.folder, cache, progress), request.wanted)
-    names = [name for one in found.segmentations for name in one.names.values()]
-    if not found.problems:
-        overrides.check_names(names, [name for name, _ in found.passed])
-    ct, own = _checked(found, names, point, request)
+    folder = find(segmentation.Place(request.folder, cache, progress), request.wanted)
+    names = [name for one in folder.segmentations for name in one.names.values()]
+    if not folder.problems:
+        overrides.check_names(names, [name for name, _ in folder.passed])
+    ct, own = _checked(folder, names, point, request)
     progress("skin")
     if own is None:
         assert ct is not None  # one of the two is there
         skin, skin_source = ct.surfaces.imaged().skin(), ct.source
     else:
         skin, skin_source = own.segmentation.skin(own.label), f"'{own.name}' of {own.segmentation.source}"
-    seen, of_seen = _seen_in_ct(request.folder, found, ct, skin)
+    seen, marker_notes = _seen_in_ct(request.folder, folder, ct, skin)
     progress("structures")
     if point is not None and ct is not None:
         _refuse_outside(point, space, ct, skin.mesh)
     stated = dict(overrides.roles) | ({} if own is None else {own.name: "skin"})
     gone = frozenset(name for name, kind in stated.items() if kind != "unknown")
-    outlines = segmentation.Outlines(found.segmentations, skin, gone)
+    outlines = segmentation.Outlines(folder.segmentations, skin, gone)
     if point is None:
         target = targets.label_target(str(request.target_label), outlines, space)
     else:
@@ -92,10 +92,10 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         target = targets.typed_target(point, outlines, space, space_stated=space_stated, hit_radius_mm=hit_radius_mm)
     region = request.region or targets.likely_region(names, target.holding.target)
     left_out = outlines.at(target.point_ct)
-    border = segmentation.bordering(target.holding.target, found.segmentations)
+    border = segmentation.bordering(target.holding.target, folder.segmentations)
     carved = {name for name, fraction in border.items() if fraction >= segmentation.ALL_ROUND}
     holding = target.holding._replace(others=target.holding.others | carved)
-    roles = [targets.assign(one.names, region, holding, left_out, stated) for one in found.segmentations]
+    roles = [targets.assign(one.names, region, holding, left_out, stated) for one in folder.segmentations]
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,
@@ -105,19 +105,19 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         hit_radius_mm=target.hit_radius_mm,
         ct=None if ct is None else ct.source,
         skin=skin_source,
-        sources=tuple(zip(found.segmentations, roles, strict=True)),
-        markers=_in_order(found.markers, ct) or tuple(filter(None, [seen])),
-        left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
+        sources=tuple(zip(folder.segmentations, roles, strict=True)),
+        markers=_in_order(folder.markers, ct) or tuple(filter(None, [seen])),
+        left_out=tuple(name for name, why in folder.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
-    notes = [*_notes(request, found, target.notes, parts, holding), *of_seen]
+    notes = [*_notes(request, folder, target.notes, parts, holding), *marker_notes]
     notes += segmentation.carved_notes(parts.rows, holding.target, border)
     return Start(case_text(parts), parts, (*notes, *outlines.notes(target.point_ct)), seen)
 
 
 def _in_order(markers: Sequence[Markers], ct: Ct | None) -> tuple[Markers, ...]:
     """Lists whose points lie in the CT first, then by the names of their files."""
-    within = [ct is None or all(map(ct.surfaces.source.grid.holds, one.points.points)) for one in markers]
+    within = [ct is None or all(map(ct.surfaces.source.grid.contains, one.points.points)) for one in markers]
     order = sorted(zip(within, markers, strict=True), key=lambda pair: (not pair[0], pair[1].source))
     return tuple(one for _, one in order)
 
@@ -127,62 +127,62 @@ def _refuse_outside(point: Floats, space: Space, ct: Ct, skin: TriangleMesh) -> 
     grid = ct.surfaces.source.grid
 
     def in_body(one: Floats) -> bool:
-        return grid.holds(one) and side_of(skin, one) is not Side.OUTSIDE
+        return grid.contains(one) and side_of(skin, one) is not Side.OUTSIDE
 
     if not in_body(point):
-        place = "the body in" if grid.holds(point) else "the CT"
+        place = "the body in" if grid.contains(point) else "the CT"
         hint = readings_inside(point, space, in_body)
         what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
         refuse(what, "--target", OUTSIDE_WAYS, "target_outside_body")
 
 
 def _checked(
-    found: Found, names: Sequence[str], point: Floats | None, request: Request
+    folder: Contents, names: Sequence[str], point: Floats | None, request: Request
 ) -> tuple[Ct | None, segmentation.Structure | None]:
     """The one CT, and the structure that is the skin where the CT is not asked: one of the two is there."""
-    problems, stated = list(found.problems), request.wanted.overrides.skin
+    problems, stated = list(folder.problems), request.wanted.overrides.skin
 
     def problem(what: str, code: str, allowed: str = ALLOWED) -> None:
         problems.append(InputListError(what, where=HERE, allowed=allowed, code=code))
 
-    cts = [one for one in found.cts if point is not None and one.surfaces.source.grid.holds(point)] or found.cts
-    listed = [f"{name} ({why})" for name, why in found.passed]
-    listed += [f"{one.source} (a CT)" for one in found.cts]
-    listed += [f"{one.source} (a segmentation)" for one in found.segmentations]
+    cts = [one for one in folder.cts if point is not None and one.surfaces.source.grid.contains(point)] or folder.cts
+    listed = [f"{name} ({why})" for name, why in folder.passed]
+    listed += [f"{one.source} (a CT)" for one in folder.cts]
+    listed += [f"{one.source} (a segmentation)" for one in folder.segmentations]
     lies = f"; found here: {first_few(listed)}" if listed else "; no file here has a supported format"
     if len(cts) > 1:
         sources = ", ".join(one.source for one in cts)
         problem(f"several CTs: {sources} (choose with --ct)", "several_cts", "--ct with the intended one")
-    if not found.segmentations and not problems:
+    if not folder.segmentations and not problems:
         problem(f"no segmentation (label map, masks or meshes){lies}", "no_segmentation")
-    skin = None if cts and stated is None else segmentation.skin_of(found.segmentations, stated)
-    if skin is None and not cts and not found.problems:
+    skin = None if cts and stated is None else segmentation.skin_of(folder.segmentations, stated)
+    if skin is None and not cts and not folder.problems:
         no_ct = f"no CT in Hounsfield units (min below {AIR_HU}), and no structure named like the skin{lies}"
-        way = f"; --skin NAME if one of these is the skin: {first_few(names)}" if names else ""
-        problem(no_ct, "no_ct", f"{ALLOWED}{way}")
+        hint = f"; --skin NAME if one of these is the skin: {first_few(names)}" if names else ""
+        problem(no_ct, "no_ct", f"{ALLOWED}{hint}")
     elif skin is not None and stated is None:
-        for why in segmentation.skin_problems(skin, found.segmentations):
+        for why in segmentation.skin_problems(skin, folder.segmentations):
             problem(why, "no_skin", "--skin NAME with the structure that is the skin")
-    counts = Counter(name for one in found.segmentations for name in set(one.names.values()))
+    counts = Counter(name for one in folder.segmentations for name in set(one.names.values()))
     if twice := [name for name, count in counts.items() if count > 1]:  # one of the two is meant
-        sources = ", ".join(one.source for one in found.segmentations if set(one.names.values()) & set(twice))
+        sources = ", ".join(one.source for one in folder.segmentations if set(one.names.values()) & set(twice))
         doubled = f"{sources} have structures with the same name, such as '{twice[0]}' (choose with --segmentation)"
         problem(doubled, "doubled", "--segmentation with the intended one")
     if problems:
         places = ["" if one.where == HERE else f"{one.where.removeprefix(f'{request.folder}/')}: " for one in problems]
         said = "; ".join(place + one.what for place, one in zip(places, problems, strict=True))
-        ways = "; ".join(dict.fromkeys(one.allowed for one in problems))
-        raise InputListError(said, where=request.folder, allowed=ways, code=problems[0].code)
+        remedies = "; ".join(dict.fromkeys(one.allowed for one in problems))
+        raise InputListError(said, where=request.folder, allowed=remedies, code=problems[0].code)
     return cts[0] if cts else None, skin
 
 
 HERE = "folder"
-"""Where a problem of the folder itself is."""
+"""Place of a problem of the folder itself."""
 
 
-def _seen_in_ct(folder: Path, found: Found, ct: Ct | None, skin: Skin) -> tuple[Markers | None, tuple[str, ...]]:
+def _seen_in_ct(folder: Path, contents: Contents, ct: Ct | None, skin: Skin) -> tuple[Markers | None, tuple[str, ...]]:
     """Markers on the skin in the CT, where no list is given and none would be replaced; and notes for a person."""
-    if found.markers or ct is None or (folder / SEEN).exists():
+    if contents.markers or ct is None or (folder / SEEN).exists():
         return None, ()
     imaged = ct.surfaces.imaged()
 
@@ -194,8 +194,8 @@ def _seen_in_ct(folder: Path, found: Found, ct: Ct | None, skin: Skin) -> tuple[
             return {"points": np.zeros((0, 3)), "why": np.array("" if error.code == "no_markers" else str(error))}
         return {"points": np.array([one.position_ct for one in seen]), "why": np.array("")}
 
-    kept = imaged.kept({"what": "markers", "skin": skin.mesh.digest}, look, dict, by=__name__)
-    points, why = kept["points"], str(kept["why"])
+    detected = imaged.kept({"what": "markers", "skin": skin.mesh.digest}, look, dict, by=__name__)
+    points, why = detected["points"], str(detected["why"])
     if not len(points):
         return None, (f"the CT may show markers ({why}): see run-twin markers {folder}",) if why else ()
     names = tuple(f"M{number}" for number in range(1, len(points) + 1))
@@ -204,14 +204,14 @@ def _seen_in_ct(folder: Path, found: Found, ct: Ct | None, skin: Skin) -> tuple[
 
 
 def _notes(
-    request: Request, found: Found, of_target: Sequence[str], parts: CaseParts, holding: targets.Holding
+    request: Request, folder: Contents, of_target: Sequence[str], parts: CaseParts, holding: targets.Holding
 ) -> Iterator[str]:
-    if found.passed:
-        yield f"left out: {first_few([f'{name} ({why})' for name, why in found.passed])}"
-    others = [one.source for one in found.cts if one.source != parts.ct]
+    if folder.passed:
+        yield f"left out: {first_few([f'{name} ({why})' for name, why in folder.passed])}"
+    others = [one.source for one in folder.cts if one.source != parts.ct]
     if others and parts.ct is not None:
         yield f"the CT is {parts.ct}, which contains the target; left out: {', '.join(others)}"
-    for one in found.segmentations:
+    for one in folder.segmentations:
         yield from one.notes
     yield from of_target
     yield from targets.role_notes(parts.rows, holding)

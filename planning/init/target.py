@@ -26,9 +26,9 @@ from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.init.segmentation import STATED, Assigned, Outlines, named_like_body, structures_of
 
 LEAST_SHOWN = 0.3
-"""Of a region's usual organs; with fewer the region is found by nothing."""
+"""Least fraction of a region's usual organs by which it is inferred."""
 LEAST_ORGANS = 3
-"""So many are enough, however long a region's list is."""
+"""Organs that are enough, however long a region's list is."""
 OWN_ORGANS: Mapping[str, frozenset[str]] = MappingProxyType(
     {
         "spine": frozenset(("spine", "spinal cord")),
@@ -54,7 +54,7 @@ def assign(
     outlines: Collection[str] = (),
     stated: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Assigned]:
-    """What a case says of each structure, by label.
+    """The role of each structure in a case, by label.
 
     Args:
         outlines: Of those that are named like the body the ones that are its outline.
@@ -84,7 +84,7 @@ def assign(
 
 
 def role_notes(rows: Sequence[Assigned], holding: Holding) -> list[str]:
-    """What a person should look at: names that the table does not know, and what is crossed because of the target."""
+    """Sentences about names that the table does not know, and about what is crossed because of the target."""
     open_lines = {NOT_ANNOTATED, STATED}
     groups = {
         f"not in the table of default roles, so avoided by {UNKNOWN_NAME.margin_mm:g} mm": [
@@ -111,7 +111,7 @@ def role_notes(rows: Sequence[Assigned], holding: Holding) -> list[str]:
 
 
 def chosen_target(names: Collection[str]) -> str:
-    """Of the structures that hold the target the one that it is; never the body's outline.
+    """The structure that is the target, of those that hold it; never the body's outline.
 
     What is named as a lesion by all of its words, else one with such a word in it, else what the table knows for
     certain (an organ that a needle crosses, or a vessel that none does), else the first: beside a pancreas that holds
@@ -153,14 +153,14 @@ def likely_region(names: Collection[str], target: str | None) -> str:
 
 
 CELLS = 64
-"""Along the longest edge of a structure's box, to find its deepest point."""
+"""Cells along the longest edge of a structure's box, to find its deepest point."""
 USUAL_HIT_MM = 5.0
 """Radius of the ball that is hit where the target lies in no structure and nobody states it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A point to reach."""
+    """The target of a new case: a point to reach, and what holds it."""
 
     point_ct: Floats  # shape (3,), LPS mm
     holding: Holding
@@ -188,33 +188,33 @@ def typed_target(
     """
     holders = _holders(point_ct, outlines)
     names = [name for name in holders if default_role(name, "other") not in {BODY, NOT_ANNOTATED}]
-    here = f"target ({point_text(point_ct, space)}) lies"
+    place_text = f"target ({point_text(point_ct, space)}) lies"
     # What would hold the point if its numbers were meant in the other space, and what to say where that is likelier.
     elsewhere: list[str] = []
     reading = ""
     if space is not Space.LOCAL and (hit_radius_mm is None or not space_stated):  # else nobody asks
-        found = _holders(to_lps(point_ct[None], Space.RAS)[0], outlines)
-        elsewhere = [name for name in found if not named_like_body(name)]
+        elsewhere_holders = _holders(to_lps(point_ct[None], Space.RAS)[0], outlines)
+        elsewhere = [name for name in elsewhere_holders if not named_like_body(name)]
         if likely_target(elsewhere) > likely_target(names):
             other = Space.RAS if space is Space.LPS else Space.LPS
             reading = f" (read in {other} it lies in '{chosen_target(elsewhere)}': --space {other})"
     if reading and not space_stated:
         place = f"in '{chosen_target(names)}'" if names else "in no structure"
         allowed = "the intended one of --space LPS and --space RAS"
-        refuse(f"{here} {place}{reading}", "--target", allowed, "target_in_other_space")
+        refuse(f"{place_text} {place}{reading}", "--target", allowed, "target_in_other_space")
     if not names and hit_radius_mm is None and likely_target(elsewhere) is Likely.LESION:
         allowed = "the other --space; or --hit-radius MM for a target in no structure"
-        refuse(f"{here} in no structure{reading}", "--target", allowed, "target_in_no_structure")
+        refuse(f"{place_text} in no structure{reading}", "--target", allowed, "target_in_no_structure")
     if not names or hit_radius_mm is not None:
         radius_mm = USUAL_HIT_MM if hit_radius_mm is None else hit_radius_mm
-        beside = f" but {', '.join(holders)}" if holders else f"; the nearest is {_nearest(point_ct, outlines)}"
-        note = f"the target lies in no structure{beside}; the target is a ball of {radius_mm:g} mm about it"
+        neighbours = f" but {', '.join(holders)}" if holders else f"; the nearest is {_nearest(point_ct, outlines)}"
+        note = f"the target lies in no structure{neighbours}; the target is a ball of {radius_mm:g} mm about it"
         return Target(point_ct, Holding(None, frozenset(holders)), (note,), radius_mm)
     chosen = chosen_target(names)
     if (line := never_crossed(chosen)) is not None:  # a slip of numbers: nothing would keep the needle out of an aorta
         danger = f"of '{line.group}' ({line.reason}): as the target's structure, it would not be avoided"
         allowed = f"a point outside it, or --target-label '{chosen}' if it is the target itself"
-        refuse(f"{here} in '{chosen}'{reading}: {danger}", "--target", allowed, "target_in_danger")
+        refuse(f"{place_text} in '{chosen}'{reading}: {danger}", "--target", allowed, "target_in_danger")
     holding = Holding(chosen, frozenset(holders) - {chosen})
     return Target(point_ct, holding, (f"the target lies in '{chosen}', the structure of the target",))
 
@@ -241,7 +241,7 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
 
 def _holders(point_ct: Floats, outlines: Outlines) -> list[str]:
     """The names of the structures that hold a point, the smallest first; none that is the body's outline."""
-    found: list[tuple[float, str]] = []
+    by_size: list[tuple[float, str]] = []
     left_out = outlines.at(point_ct)
     for segmentation in outlines.segmentations:
         for label in segmentation.near(point_ct):
@@ -250,8 +250,8 @@ def _holders(point_ct: Floats, outlines: Outlines) -> list[str]:
                 continue
             mesh = segmentation.surface(label)
             if side_of(mesh, point_ct) is Side.INSIDE:
-                found.append((float(np.prod(np.ptp(mesh.bounds, axis=0))), name))
-    return [name for _, name in sorted(found)]
+                by_size.append((float(np.prod(np.ptp(mesh.bounds, axis=0))), name))
+    return [name for _, name in sorted(by_size)]
 
 
 def _deepest_point(mesh: TriangleMesh) -> tuple[Floats, int]:

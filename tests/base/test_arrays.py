@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 import scipy
 
-from puncture_twin.planning.base.arrays import counts_of, grown, widened
+from puncture_twin.planning.base.arrays import grown, label_counts, widened
 from puncture_twin.planning.search.table import column, truths
 
 
@@ -29,7 +29,7 @@ def test_a_grown_mask_has_its_neighbours_by_a_face(mask):
 
 def test_numbers_are_counted_as_by_bincount(rng):
     numbers = rng.integers(0, 9, (6, 7, 8))
-    assert np.array_equal(counts_of(numbers, 12), np.bincount(numbers.ravel(), minlength=13))
+    assert np.array_equal(label_counts(numbers, 12), np.bincount(numbers.ravel(), minlength=13))
 
 
 def test_numbers_and_truths_are_those_that_pyarrow_makes(rng):

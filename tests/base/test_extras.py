@@ -28,7 +28,7 @@ def test_planner_map_and_page_need_no_extra():
     """All of the planner, and what searches, plans, exports, draws and reads touches, is imported without any extra."""
     missing = [*MODULES["twin"], *MODULES["mirror"], "SimpleITK", "pytest", "gdcm", "h5py"]
     rooms = tuple(f"puncture_twin.{room}." for room in ("planning", "twin.report", "twin.jobs.patient"))
-    rehearsing = ("twin.jobs.patient.rehearsed", "twin.jobs.patient.ways_job")
+    rehearsing = ("twin.jobs.patient.rehearsed", "twin.jobs.patient.guidance_job")
     others = ("planning.collision_cases", "twin.report.scene.film", *rehearsing)
     names = [name for name in modules() if name.startswith((*rooms, "puncture_twin.twin.jobs.experiment.pivot_job"))]
     names = [name for name in names if not name.startswith(tuple(f"puncture_twin.{other}" for other in others))]

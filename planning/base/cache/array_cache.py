@@ -1,4 +1,4 @@
-"""Arrays that cost time to make, kept by the hash of what they were made from and of the code that made them.
+"""The cache of computed arrays, keyed by the hash of what they were made from and of the code that made them.
 
 The folder may be deleted at any time. An entry is used only if its digest covers its content and its key: the hashes
 of all inputs, the parameters, the source of the module that makes it with all that it imports, and the versions of the
@@ -37,7 +37,7 @@ DEAD_AFTER_S = 24 * 3600.0
 
 
 class StoredFile(NamedTuple):
-    """The name of an entry."""
+    """Name of a cache entry: the module that made it, that module's generation, and the key of its content."""
 
     maker: str
     generation: str  # 16 hexadecimal digits of its source and the libraries' versions
@@ -45,12 +45,12 @@ class StoredFile(NamedTuple):
 
     @property
     def file(self) -> str:
-        """The name of its file."""
+        """The entry's file name."""
         return f"{self.maker}.{self.generation}.{self.key}{SUFFIX}"
 
 
 def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> None:
-    """Write an entry, whole or not at all, then make the folder fit. Raises OSError, InputError: it cannot be."""
+    """Write an entry, whole or not at all, then bound the folder. Raises OSError, InputError: it cannot be written."""
     if len(content) > most_bytes:
         return
     path = folder / entry.file
@@ -63,24 +63,24 @@ def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> N
 
 def _tidy(folder: Path, entry: StoredFile, most_bytes: int) -> None:
     """Remove what this version of the maker cannot use, what the dead have left, and the oldest beyond the bound."""
-    kept: list[tuple[int, int, Path]] = []
-    with os.scandir(folder) as found:
-        for one in found:
+    entries: list[tuple[int, int, Path]] = []
+    with os.scandir(folder) as listing:
+        for file in listing:
             with suppress(OSError):  # another process removes it meanwhile, or it is not ours
-                if not one.is_file(follow_symlinks=False):
+                if not file.is_file(follow_symlinks=False):
                     continue
-                seen, path = one.stat(follow_symlinks=False), Path(one.path)
-                named = ENTRY.fullmatch(one.name)
+                seen, path = file.stat(follow_symlinks=False), Path(file.path)
+                named = ENTRY.fullmatch(file.name)
                 if named is None:
-                    outlived = bool(TEMPORARY.fullmatch(one.name)) and time.time() - seen.st_mtime > DEAD_AFTER_S
+                    outlived = bool(TEMPORARY.fullmatch(file.name)) and time.time() - seen.st_mtime > DEAD_AFTER_S
                 else:
                     outlived = named["maker"] == entry.maker and named["generation"] != entry.generation
                 if outlived:
                     path.unlink(missing_ok=True)
                 elif named is not None:
-                    kept.append((seen.st_mtime_ns, seen.st_size, path))
-    total = sum(size for _, size, _ in kept)
-    for _, size, path in sorted(kept):
+                    entries.append((seen.st_mtime_ns, seen.st_size, path))
+    total = sum(size for _, size, _ in entries)
+    for _, size, path in sorted(entries):
         if total <= most_bytes:
             break
         with suppress(OSError):
@@ -90,7 +90,7 @@ def _tidy(folder: Path, entry: StoredFile, most_bytes: int) -> None:
 
 Value = TypeVar("Value")
 MEMORY_BYTES = 500_000_000
-"""What is kept of patients, also beside a search: the meshes and trees of some ten whole bodies."""
+"""Bound of what a process holds of patients, also during a search: the meshes and trees of some ten whole bodies."""
 
 
 class Memory:
@@ -107,7 +107,7 @@ class Memory:
         self._kept: OrderedDict[tuple[Hashable, ...], tuple[Any, int]] = OrderedDict()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For another process: an empty one."""
+        """For pickling: another process gets an empty memory."""
         return Memory, (self._most,)
 
     @property
@@ -131,7 +131,7 @@ class Memory:
                 self._held -= gone
         return value
 
-    def holds(self, key: tuple[Hashable, ...]) -> bool:
+    def contains(self, key: tuple[Hashable, ...]) -> bool:
         """Whether the value of a key is there."""
         return key in self._kept
 
@@ -142,23 +142,23 @@ class Memory:
 
 
 NO_MEMORY = Memory()
-"""Makes everything anew."""
+"""A memory that holds nothing."""
 FOLDER_VARIABLE = "PUNCTURE_TWIN_CACHE"
 """Environment variable that names the folder; empty switches the cache off."""
 SIZE_VARIABLE = "PUNCTURE_TWIN_CACHE_MB"
 """Environment variable with the most megabytes (of 1,000,000 bytes) that the folder may hold."""
 MOST_BYTES = 2_000_000_000
-"""Where it says nothing: the surfaces of some twenty whole bodies."""
+"""Bound where the variable is not set: the surfaces of some twenty whole bodies."""
 LIBRARIES = (
     *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "llvmlite", "python-fcl", "trimesh"),
     *("fast-simplification", "pillow", "pyarrow", "pydantic", "pydicom", "python-gdcm", "h5py"),
 )
-"""Whose versions decide what is made."""
+"""Libraries whose versions decide what is computed."""
 
 
 @dataclass(frozen=True)
 class _Read(Generic[Value]):
-    """Arrays, and what was read from them."""
+    """Arrays, and the value that was read from them."""
 
     arrays: Arrays
     value: Value
@@ -204,8 +204,8 @@ class Cache:
                 return read(_frozen(make()))
             return self._from_folder(_entry(made_from, by), make, read).value
 
-        def size(found: _Read[Any]) -> int:
-            return sum(array.nbytes for array in found.arrays.values())
+        def size(entry_value: _Read[Any]) -> int:
+            return sum(array.nbytes for array in entry_value.arrays.values())
 
         entry = _entry(made_from, by)
         return self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read), size).value
@@ -213,22 +213,22 @@ class Cache:
     def _from_folder(
         self, entry: StoredFile, make: Callable[[], Arrays], read: Callable[[Arrays], Value]
     ) -> _Read[Value]:
-        found = None if self.folder is None else _kept(self.folder / entry.file, entry.key, read)
-        if found is None:
-            made = _frozen(make())
-            found = _Read(made, read(made))
+        stored = None if self.folder is None else _stored(self.folder / entry.file, entry.key, read)
+        if stored is None:
+            arrays = _frozen(make())
+            stored = _Read(arrays, read(arrays))
             if self.folder is not None and module_unedited(entry.maker):  # else it may be of newer code than its stamp
                 with suppress(OSError, InputError):  # a folder that cannot be written to costs time, not the result
-                    store(self.folder, entry, entry_file.packed(made, entry.key), self.most_bytes)
-        return found
+                    store(self.folder, entry, entry_file.packed(arrays, entry.key), self.most_bytes)
+        return stored
 
 
 NO_CACHE = Cache(None)
-"""Makes everything anew."""
+"""A cache without a folder: everything is computed anew."""
 
 
 def user_cache() -> Cache:
-    """This user's: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
+    """The user's cache: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
 
     Raises InputError: ``$PUNCTURE_TWIN_CACHE_MB`` is no number.
     """
@@ -249,7 +249,7 @@ def _most_bytes() -> int:
 
 
 def _frozen(arrays: Arrays) -> Arrays:
-    """Read-only, as arrays from the folder are: several will hold them, and kernels are compiled for one kind alone."""
+    """The arrays, made read-only like those from the folder: all are shared, and kernels compile for one kind only."""
     for array in arrays.values():
         array.setflags(write=False)
     return arrays
@@ -268,12 +268,12 @@ def _generation(by: str) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
-def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
+def _stored(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
     """The arrays of an entry; None where there is no entry, or, with a note, a damaged one."""
     entry_file.check_own(path)
     try:
         arrays = entry_file.unpacked(entry_file.read_plain_file(path), key)
-        found = _Read(arrays, read(arrays))
+        stored = _Read(arrays, read(arrays))
     except FileNotFoundError:
         return None
     except (DamagedError, ValueError, KeyError, TypeError, InputError) as error:
@@ -282,4 +282,4 @@ def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value]
         return None
     with suppress(OSError):  # another process has removed it, or it is another user's
         os.utime(path)  # it was used
-    return found
+    return stored

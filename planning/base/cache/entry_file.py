@@ -31,7 +31,7 @@ class DamagedError(Exception):
 
 
 def packed(arrays: Arrays, key: str) -> bytes:
-    """The file that holds these arrays."""
+    """Bytes of the entry file that holds these arrays."""
     whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     header = json.dumps([[name, array.dtype.str, array.shape] for name, array in whole.items()]).encode() + b"\n"
     body = bytearray(header)
@@ -41,7 +41,7 @@ def packed(arrays: Arrays, key: str) -> bytes:
 
 
 def unpacked(content: bytes, key: str) -> Arrays:
-    """The arrays of a file, read-only. Raises DamagedError: it is not the file that was written for this key."""
+    """The arrays of an entry file, read-only. Raises DamagedError: it is not the file that was written for this key."""
     start = len(MAGIC) + DIGEST_BYTES
     body = memoryview(content)[start:]
     if not content.startswith(MAGIC) or content[len(MAGIC) : start] != _digest(body, key):
@@ -154,7 +154,7 @@ def _refusal(path: Path, what: str) -> InputError:
 
 
 def read_plain_file(path: Path) -> bytes:
-    """The content of a real file; a pipe is not waited for. Raises FileNotFoundError, DamagedError: it is none."""
+    """The bytes of a regular file; a pipe is not waited for. Raises FileNotFoundError, DamagedError: it is none."""
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
             raise DamagedError("is not a regular file")

@@ -35,13 +35,13 @@ def source_stamp(module: str) -> str:
 
 
 def sources_with(word: bytes) -> list[str]:
-    """The project's source files in which a word stands."""
-    found = list[str]()
+    """The project's source files that contain a word."""
+    matches = list[str]()
     for place, folders, files in (one for part in PARTS for one in os.walk(PACKAGE / part)):
         folders[:] = (name for name in folders if name != "__pycache__")
         sources = (f"{place}/{name}" for name in files if name.endswith(".py"))
-        found += [file for file in sources if word in _source(file)]
-    return found
+        matches += [file for file in sources if word in _source(file)]
+    return matches
 
 
 def stamp_of(files: Iterable[str]) -> str:
@@ -117,12 +117,12 @@ def _source_digest(file: str) -> bytes:
 @cache
 def _imported(file: str) -> tuple[str, ...]:
     """The project's files that a file imports; a room hands on no name of its own."""
-    found: list[str] = []
+    files: list[str] = []
     for place, names in IMPORTED.findall(_source(file)):
         module = f"puncture_twin{place.decode()}"
-        found += _files_of(module)
-        found += [one for name in re.findall(rb"\w+", names) for one in _files_of(f"{module}.{name.decode()}")]
-    return tuple(found)
+        files += _files_of(module)
+        files += [one for name in re.findall(rb"\w+", names) for one in _files_of(f"{module}.{name.decode()}")]
+    return tuple(files)
 
 
 @cache

@@ -21,7 +21,7 @@ MANIFEST_NAME = "manifest.json"
 TIMINGS_NAME = "timings.json"
 """Wall times and dates of the runs: the one file of a set whose bytes differ from run to run, listed without a hash."""
 FORMAT = "puncture-twin output set"
-"""Tells this manifest from any other ``manifest.json``."""
+"""Marks this program's manifest among others named ``manifest.json``."""
 LAYOUT = 1
 """Version of the manifest's layout."""
 MAX_MANIFEST_BYTES = 50_000_000
@@ -35,7 +35,7 @@ ANOTHER_FOLDER = "another output folder, or remove that file"
 
 @dataclass(frozen=True)
 class ManifestEntry:
-    """What one command wrote."""
+    """The files that one command wrote, with their hashes, its inputs and what it depends on."""
 
     version: str
     inputs: tuple[Input, ...]
@@ -122,18 +122,18 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
 
 
 def problems(folder: Path) -> tuple[str, ...]:
-    """What keeps a folder from being one whole set, in sentences. Raises InputError: see `read_manifest`."""
+    """Why a folder is not one whole set, in sentences. Raises InputError: see `read_manifest`."""
     manifest = read_manifest(folder)
     if manifest is None:
         return (f"{MANIFEST_NAME} is missing",)
-    found = [f"{name} is left over from an unfinished run" for name in manifest.unfinished if (folder / name).exists()]
+    faults = [f"{name} is left over from an unfinished run" for name in manifest.unfinished if (folder / name).exists()]
     for name, digest in manifest.files.items():
         path = folder / name
         if not path.is_file():
-            found.append(f"{name} is missing")
+            faults.append(f"{name} is missing")
         elif file_digest(path) != digest:
-            found.append(f"{name} does not match its entry")
-    return tuple(found)
+            faults.append(f"{name} does not match its entry")
+    return tuple(faults)
 
 
 def read_manifest(folder: Path) -> Manifest | None:

@@ -1,4 +1,4 @@
-"""One mechanism for every command that writes: an output folder is one locked set; no kill leaves a mix that passes.
+"""Writing of an output folder as one locked set, for every command: no kill leaves a mix that passes.
 
 New files are written into a draft, a folder of its own inside the output folder. When all of them are there:
 
@@ -35,18 +35,18 @@ from puncture_twin.planning.base.strict_json import read_json
 from puncture_twin.planning.base.text import first_few
 
 NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO})
-"""What the system says of a disk that takes no more."""
+"""The system's error numbers of a full disk."""
 LITTLE_SPACE_BYTES = 65_536
 """A library's failure without a number, on a disk with less than this, is the disk's."""
 LOCK_NAME = ".puncture-twin-lock"
-"""Lies in the folder while a command writes into it; without its process it locks nothing."""
+"""File that lies in the folder while a command writes into it; without its process it locks nothing."""
 DRAFT_PREFIX = ".puncture-twin-draft-"
 """Folders of this name are drafts; who holds the folder's lock knows that nobody else is writing to one."""
 
 
 @dataclass(eq=False)
 class Draft:
-    """Files that are being written and belong to nothing yet."""
+    """Files of a command that are being written and belong to no set yet."""
 
     command: str  # whose; the name of its entry
     out: Path
@@ -142,11 +142,11 @@ def _publish(draft: Draft, started: datetime) -> None:
     gone = {name for name, entry in old.entries.items() if name in own or files & set(entry.files)}
     gone |= _dependents(old, gone)
     _refuse_foreign(draft, files)
-    kept = {name: entry for name, entry in old.entries.items() if name not in gone}
+    stays = {name: entry for name, entry in old.entries.items() if name not in gone}
     left = files.union(old.unfinished, *(old.entries[name].files for name in gone))
-    (state / "before").write_text(manifest.Manifest(kept, tuple(sorted(left))).text(), encoding="utf-8")
-    (state / "after").write_text(manifest.Manifest({**kept, **new}).text(), encoding="utf-8")
-    (state / "timings").write_text(_timings(draft, kept, started), encoding="utf-8")
+    (state / "before").write_text(manifest.Manifest(stays, tuple(sorted(left))).text(), encoding="utf-8")
+    (state / "after").write_text(manifest.Manifest({**stays, **new}).text(), encoding="utf-8")
+    (state / "timings").write_text(_timings(draft, stays, started), encoding="utf-8")
     with uninterrupted():
         (state / "before").replace(out / manifest.MANIFEST_NAME)
         for name in sorted(files):
@@ -183,14 +183,14 @@ def _entries(draft: Draft) -> dict[str, manifest.ManifestEntry]:
 
 def _dependents(old: manifest.Manifest, names: set[str]) -> set[str]:
     """The entries that depend on some, directly or through others."""
-    found: set[str] = set()
-    while more := {name for name, entry in old.entries.items() if {*names, *found} & set(entry.depends_on)} - found:
-        found |= more
-    return found
+    above: set[str] = set()
+    while more := {name for name, entry in old.entries.items() if {*names, *above} & set(entry.depends_on)} - above:
+        above |= more
+    return above
 
 
 def _refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
-    """Never overwrite what no run of this program has written. Raises InputError: names the first such file."""
+    """Refuse to overwrite what no run of this program has written. Raises InputError: names the first such file."""
     known = {*draft.old.files, *draft.old.unfinished}
     if (draft.out / manifest.MANIFEST_NAME).exists():
         known.add(manifest.TIMINGS_NAME)
@@ -222,7 +222,7 @@ def _remove(out: Path, names: Iterable[str]) -> None:
                     (out / parent).rmdir()
 
 
-def _timings(draft: Draft, kept: Iterable[str], started: datetime) -> str:
+def _timings(draft: Draft, stays: Iterable[str], started: datetime) -> str:
     """The folder's timings with those of the command put in; those of entries that stay are kept."""
     try:
         document = read_json(
@@ -231,7 +231,7 @@ def _timings(draft: Draft, kept: Iterable[str], started: datetime) -> str:
     except InputError:  # no result depends on it
         document = {}
     before = document if isinstance(document, dict) else {}
-    timings = {name: before[name] for name in kept if name in before}
+    timings = {name: before[name] for name in stays if name in before}
     seconds = {stage: round(float(spent), 3) for stage, spent in draft.seconds.items()}
     timings[draft.command] = {"started": started.isoformat(timespec="seconds"), "seconds": seconds}
     return json.dumps(timings, indent=1, allow_nan=False) + "\n"
@@ -267,7 +267,7 @@ def _explained(out: Path) -> Iterator[None]:
 
 
 def disk_is_full(error: OSError, out: Path) -> bool:
-    """Whether it is the disk of a folder that takes no more; some libraries fail without a number."""
+    """Whether the disk of a folder is full; some libraries fail without a number."""
     with suppress(OSError):
         return error.errno in NO_SPACE or (error.errno is None and shutil.disk_usage(out).free < LITTLE_SPACE_BYTES)
     return False
@@ -275,7 +275,7 @@ def disk_is_full(error: OSError, out: Path) -> bool:
 
 @contextmanager
 def _folder(out: Path) -> Iterator[None]:
-    """Make the folder, and remove it again if nothing came to lie in it."""
+    """Context with the folder made, and removed again if it stays empty."""
     missing = [place for place in (out, *out.parents) if not place.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -26,7 +26,7 @@ TILTED = (
     "they do not cover counts as not scanned"
 )
 UNMEASURED_HU = -2000.0
-"""Written where the scanner did not measure: far below air, so that nothing takes it for air or body."""
+"""Value where the scanner did not measure: far below air, so that nothing takes it for air or body."""
 
 
 @dataclass(frozen=True, eq=False)

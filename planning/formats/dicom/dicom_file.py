@@ -1,4 +1,4 @@
-"""The bytes of a DICOM file to its data set, once its magic, its transfer syntax and its wholeness are checked.
+"""The data set of a DICOM file's bytes, once its magic, its transfer syntax and its wholeness are checked.
 
 Whole is a data set in which every element lies inside its parent, every sequence is closed, and tags rise. The library
 that reads values takes what is left of an element that was cut short, and keeps the last of two elements of one tag: a
@@ -29,7 +29,7 @@ ALLOWED = "a complete DICOM file"
 
 @contextmanager
 def refused_if_damaged(where: str | Path) -> Iterator[None]:
-    """One InputError for whatever the library raises for damaged values, and none of its warnings on the terminal."""
+    """Context with one InputError for whatever the library raises for damaged values, and without its warnings."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -58,9 +58,9 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
         implicit = syntax == IMPLICIT
         # Without the zeros that some programs write behind a data set.
         length = _Walk(body, path).data_set(0, len(body), implicit=implicit, depth=0, closed=False)
-        found = read_dataset(io.BytesIO(body[:length]), implicit, True)
-        found.file_meta = meta
-        return found
+        dataset = read_dataset(io.BytesIO(body[:length]), implicit, True)
+        dataset.file_meta = meta
+        return dataset
 
 
 def read_meta(stream: BinaryIO) -> FileMetaDataset:
@@ -80,24 +80,24 @@ def refuse_syntax(syntax: UID, where: str | Path) -> NoReturn:
 
 
 MAX_TEXT = 200
-"""Characters of a name or a description; standard types hold 64."""
+"""Most characters of a name or a description; standard types hold 64."""
 
 
 def value(data: Dataset, keyword: str, *, where: str) -> Any:
     """The value of an element; None where it is absent or empty."""
     with refused_if_damaged(where):
-        found = data[keyword].value if keyword in data else None
-    return None if found is None or found == "" else found
+        stored = data[keyword].value if keyword in data else None
+    return None if stored is None or stored == "" else stored
 
 
 def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[float, ...]:
     """An element's value as so many finite numbers. Raises InputError: missing, of another count, or not finite."""
-    found = value(data, keyword, where=where)
+    stored = value(data, keyword, where=where)
     with refused_if_damaged(f"{where}: {keyword}"):
-        plain = tuple(float(one) for one in _listed(found))
+        plain = tuple(float(one) for one in _listed(stored))
     if len(plain) != count or not all(map(math.isfinite, plain)):
-        what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        refuse(what, where, plural(count, "finite number"), "missing_tag" if found is None else "bad_tag")
+        what = f"{name(keyword)} is missing" if stored is None else f"{name(keyword)} is {str(stored)[:100]}"
+        refuse(what, where, plural(count, "finite number"), "missing_tag" if stored is None else "bad_tag")
     return plain
 
 
@@ -108,16 +108,16 @@ def number(data: Dataset, keyword: str, *, where: str) -> float:
 
 def whole(data: Dataset, keyword: str, *, low: int, high: int, where: str) -> int:
     """An element's value as one whole number between two others. Raises InputError: missing, not whole or outside."""
-    found = number(data, keyword, where=where)
-    if found != int(found) or not low <= found <= high:
-        refuse(f"{name(keyword)} is {found:g}", where, f"a whole number from {low} to {high}", "bad_tag")
-    return int(found)
+    stated = number(data, keyword, where=where)
+    if stated != int(stated) or not low <= stated <= high:
+        refuse(f"{name(keyword)} is {stated:g}", where, f"a whole number from {low} to {high}", "bad_tag")
+    return int(stated)
 
 
 def text(data: Dataset, keyword: str, *, where: str) -> str:
     """The value as text without surrounding spaces, "" where absent; unprintable characters become ``?``."""
-    found = value(data, keyword, where=where)
-    plain = "" if found is None else str(found).strip(" \0")[:MAX_TEXT]
+    stored = value(data, keyword, where=where)
+    plain = "" if stored is None else str(stored).strip(" \0")[:MAX_TEXT]
     return "".join(letter if letter.isprintable() else "?" for letter in plain)
 
 
@@ -126,8 +126,8 @@ def texts(data: Dataset, keyword: str, *, where: str) -> tuple[str, ...]:
     return tuple(str(one).strip() for one in _listed(value(data, keyword, where=where)))
 
 
-def _listed(found: Any) -> list[Any]:
-    return list(found) if isinstance(found, MultiValue | list | tuple) else [] if found is None else [found]
+def _listed(stored: Any) -> list[Any]:
+    return list(stored) if isinstance(stored, MultiValue | list | tuple) else [] if stored is None else [stored]
 
 
 def sop_class_of(data: Dataset, *, where: str) -> str:
@@ -138,18 +138,18 @@ def sop_class_of(data: Dataset, *, where: str) -> str:
 
 def items(data: Dataset, keyword: str, *, where: str) -> list[Dataset]:
     """The items of a sequence, none where it is absent. Raises InputError: it is no sequence."""
-    found = value(data, keyword, where=where)
-    if found is None:
+    stored = value(data, keyword, where=where)
+    if stored is None:
         return []
     with refused_if_damaged(where):
-        listed = list(found)
+        listed = list(stored)
     if not all(isinstance(one, Dataset) for one in listed):
         refuse(f"{name(keyword)} is not a sequence", where, "a sequence of items", "bad_tag")
     return listed
 
 
 def name(keyword: str) -> str:
-    """A keyword with its tag, as people look it up."""
+    """Text of a keyword with its tag."""
     tag = tag_for_keyword(keyword) or 0
     return f"{keyword} ({tag >> 16:04X},{tag & 0xFFFF:04X})"
 
@@ -161,9 +161,9 @@ LONG_FORM = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b
 """Value representations whose length has four bytes."""
 SHORT_FORM = frozenset(b"AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US".split())
 MAX_DEPTH = 16
-"""Sequences in sequences; structured reports go deeper, images and contours do not reach half of it."""
+"""Most sequences in sequences; structured reports go deeper, images and contours do not reach half of it."""
 MAX_ELEMENTS = 3_000_000
-"""In one file: a multi-frame image of 10,000 slices has a tenth of it."""
+"""Most elements of a file: a multi-frame image of 10,000 slices has a tenth of it."""
 
 
 class _Walk:

@@ -16,9 +16,9 @@ from puncture_twin.planning.formats.dicom.dicom_file import name, refuse_syntax,
 from puncture_twin.planning.formats.dicom.storage import PLAIN
 
 MAX_SIDE = 4096
-"""Pixels along a row or a column: twice the finest scanner's."""
+"""Most pixels along a row or a column: twice the finest scanner's."""
 MAX_FRAMES = 20_000
-"""In one file."""
+"""Most frames of a file."""
 
 
 @dataclass(frozen=True)

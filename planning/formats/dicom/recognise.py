@@ -18,7 +18,7 @@ from puncture_twin.planning.formats.dicom import dicom_file, storage
 from puncture_twin.planning.formats.folder import FILE, FOLDER, HIDDEN, Entry, entries, unaccounted
 
 MAX_FILES = 50_000
-"""In one folder; the longest series have some 5,000 slices."""
+"""Most files of a folder; the longest series have some 5,000 slices."""
 NO_SLICES = frozenset(("LOCALIZER", "SCOUT", "TOPOGRAM", "SCREEN SAVE", "DOSE_INFO", "DOSE", "SUMMARY", "PROTOCOL"))
 """Values of ImageType that are no slices: scouts, and pages of text that are stored among the slices."""
 _TAGS = [
@@ -95,12 +95,12 @@ def described(data: Dataset, path: Path) -> DicomFile:
 def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]:
     """Every DICOM file of a folder by name, and every other entry. Raises InputError: too many, or a damaged one."""
     listed = entries(folder, most=MAX_FILES)
-    found = {one: recognise(folder / one.name) for one in listed if one.what == FILE}
-    for one in found.values():
+    recognised = {one: recognise(folder / one.name) for one in listed if one.what == FILE}
+    for one in recognised.values():
         if one is not None and not one.name.isprintable():
             refuse(f"file name {one.name!a}", folder, "names of printable characters", "bad_name")
-    files = tuple(one for one in found.values() if one is not None)
-    return files, tuple(one for one in listed if found.get(one) is None)
+    files = tuple(one for one in recognised.values() if one is not None)
+    return files, tuple(one for one in listed if recognised.get(one) is None)
 
 
 SHOWN, LOOKED_AT = 6, 100
@@ -119,24 +119,24 @@ class SeriesFiles:
 def choose_series(path: Path) -> SeriesFiles:
     """The files of the CT series that a path means. Raises InputError: none there, several, or a file of no series."""
     folder = path if is_folder(path) else path.parent
-    found, others = list_folder(folder)
-    slices = [one for one in found if one.is_slice]
+    files, others = list_folder(folder)
+    slices = [one for one in files if one.is_slice]
     if folder != path:
-        named = next((one for one in found if one.name == path.name), None)
+        named = next((one for one in files if one.name == path.name), None)
         if named is None or not named.is_slice:
             what = "not a DICOM file" if named is None else f"{named.sop_class}, not a CT slice"
             refuse(what, path, "a slice of a CT series, or the folder of a series", "not_a_ct")
         slices = [one for one in slices if one.series_uid == named.series_uid]
-    _check_one_series(slices, found, others, path)
+    _check_one_series(slices, files, others, path)
     names = tuple(one.name for one in slices)
-    read = {one.name: Entry(one.name, FILE) for one in found}
+    read = {one.name: Entry(one.name, FILE) for one in files}
     left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
     if lost := [one for one in left if _may_be_slice(one, names)]:
         what = f"other files, possibly slices, cannot be read: {first_few([one.line for one in lost])}"
         allowed = "every slice of the series as a complete DICOM file (download or copy it again, or move it elsewhere)"
         refuse(what, path, allowed, "slices_not_read")
-    below = [one for one in others if one.what == FOLDER and _holds_dicom(folder / one.name)]
-    aside = [one for one in found if one.name not in set(names)]
+    below = [one for one in others if one.what == FOLDER and _contains_dicom(folder / one.name)]
+    aside = [one for one in files if one.name not in set(names)]
     kinds = Counter(
         f"{one.sop_class} '{one.series}'" if one.kind is storage.Kind.CT else one.sop_class for one in aside
     )
@@ -152,7 +152,7 @@ def _may_be_slice(one: Entry, names: Sequence[str]) -> bool:
     return one.what != FOLDER and bool(one.what not in (FILE, HIDDEN) or named)
 
 
-def _holds_dicom(folder: Path) -> bool:
+def _contains_dicom(folder: Path) -> bool:
     """Whether slices may lie in a folder next to the series, by its first files."""
     return any(storage.is_dicom_file(folder / one.name) for one in entries(folder, most=MAX_FILES)[:LOOKED_AT])
 

@@ -19,7 +19,7 @@ from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import MAX_SPACING_MM, MIN_SPACING_MM, VolumeGrid, check_shape
 
 MAX_SLICES = 20_000
-"""Between the first and the last frame."""
+"""Most slices from the first to the last frame."""
 ON_GRID = 0.05
 """Fraction of a voxel by which a segmentation's grid may miss the CT's and still be on it."""
 HALF = 0.5
@@ -109,10 +109,10 @@ def _frames(data: Dataset, names: dict[int, str], ct: CtSeries | None, path: Pat
 
 
 def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
-    found = groups.find("SegmentIdentificationSequence", label)
-    if len(found) != 1:
-        refuse(f"{len(found)} items state its segment", label, "one", "wrong_count")
-    segment = dicom_file.whole(found[0], "ReferencedSegmentNumber", low=1, high=65535, where=label)
+    holder = groups.find("SegmentIdentificationSequence", label)
+    if len(holder) != 1:
+        refuse(f"{len(holder)} items state its segment", label, "one", "wrong_count")
+    segment = dicom_file.whole(holder[0], "ReferencedSegmentNumber", low=1, high=65535, where=label)
     if segment not in names:
         refuse(f"is of segment {segment}, which is not listed", label, f"{sorted(names)}"[:200], "unknown_segment")
     return segment
@@ -136,8 +136,8 @@ def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[
     """The affine of the frames' own grid, and the slice of each frame; frames that are left out are empty."""
     first = planes[0]
     for other in planes[1:]:
-        turned = np.abs(other.axes_ct - first.axes_ct).max() > slices.AXES_TOLERANCE
-        if turned or not np.allclose(other.spacing_mm, first.spacing_mm, rtol=slices.SPACING_TOLERANCE):
+        rotated = np.abs(other.axes_ct - first.axes_ct).max() > slices.AXES_TOLERANCE
+        if rotated or not np.allclose(other.spacing_mm, first.spacing_mm, rtol=slices.SPACING_TOLERANCE):
             refuse("its frames have several orientations or pixel sizes", path, "one of each", "mixed_geometry")
     origins = np.array([plane.origin_ct for plane in planes])
     along = origins @ first.normal_ct
@@ -204,11 +204,11 @@ def _states_empty_frames(data: Dataset, frames: _Frames, path: Path) -> bool:
 
 
 def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> named_masks.Mask:
-    made = np.zeros(placed.grid.shape, np.uint8, order="F")
+    mask = np.zeros(placed.grid.shape, np.uint8, order="F")
     for frame in np.flatnonzero(frames.segments == segment).tolist():
         image = _image(data, frame, frames.rows, frames.columns, path)
-        made[:, :, placed.first + int(frames.steps[frame])] = image.T
-    return made
+        mask[:, :, placed.first + int(frames.steps[frame])] = image.T
+    return mask
 
 
 def _image(data: Dataset, frame: int, rows: int, columns: int, path: Path) -> named_masks.Mask:

@@ -71,13 +71,13 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
             what = f"{name('NumberOfFrames')} is {frames} in a CT image of one slice"
             refuse(what, file, "one frame, or an Enhanced CT image", "wrong_count")
         return [_slice(file, 0, file, Groups(data, data))]
-    found = []
+    headers = []
     for frame, groups in enumerate(frame_groups(data, frames, where=file)):
         label = f"{file}, frame {frame + 1}"
         types = [texts(one, "FrameType", where=label) for one in groups.find("CTImageFrameTypeSequence", label)]
         if not {part.upper() for some in types for part in some} & NO_SLICES:
-            found.append(_slice(file, frame, label, groups))
-    return found
+            headers.append(_slice(file, frame, label, groups))
+    return headers
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,18 +159,18 @@ AXES_TOLERANCE = 1e-3
 PLACE_TOLERANCE_MM = 0.1
 """Tolerance of a slice's place in the stack: positions that are rounded to a tenth are within 0.05."""
 PLACE_TOLERANCE = 0.1
-"""Tolerance of its place as a fraction of the step, where that is less."""
+"""Tolerance of a slice's place as a fraction of the step, where that is less."""
 SPACING_TOLERANCE = 1e-4
 """Relative tolerance between the pixel sizes of two slices."""
 ONE_PLACE_MM = 1e-3
-"""No two slices of any scanner are so near."""
+"""Distance within which two slices lie at one place: no scanner's are so near."""
 SHOWN = 4
-"""Slices that a message names at most."""
+"""Most slices that a message names."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Slices at even steps."""
+    """A regular stack: slices at even steps."""
 
     slices: tuple[Slice, ...]  # in the order in which they lie along the normal
     plane: Plane  # the first one's

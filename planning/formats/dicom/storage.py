@@ -1,4 +1,4 @@
-"""Which bytes are DICOM, and what such a file is by its SOP class: never by its name, and not by its modality.
+"""Recognition of DICOM bytes, and the kind of a file by its SOP class: not by its name or its modality.
 
 Unique identifiers from DICOM PS3.4 (2024), table B.5-1, and PS3.6, table A-1.
 """

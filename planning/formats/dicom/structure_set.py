@@ -28,7 +28,7 @@ CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
 ON_SLICE = 0.1
 """Fraction of the step by which a contour may miss its slice."""
 MAX_CONTOUR_POINTS = 100_000
-"""In one contour: an image of 1000 pixels has 4000 around it."""
+"""Most points of a contour: an image of 1000 pixels has 4000 around it."""
 LEAN = 1.5
 """Parts in the two slices about a gap are one where they lie no farther apart sideways than so often its height: what
 leans by 60 degrees and is thin."""
@@ -39,7 +39,7 @@ GAPS = (
     "evenly spaced, and otherwise left empty, in"
 )
 MAX_LENGTH = 5_000_000
-"""Pixels along one contour; the finest line through every pixel of an image has fewer."""
+"""Most pixels along one contour; the finest line through every pixel of an image has fewer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,34 +87,34 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
 
 def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
-    found: dict[int, str] = {}
+    names: dict[int, str] = {}
     for item in dicom_file.items(data, "StructureSetROISequence", where=path.name):
         roi = dicom_file.whole(item, "ROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
-        if roi in found:
+        if roi in names:
             refuse(f"two regions have the number {roi}", path, "each number once", "duplicate_number")
         frame = dicom_file.text(item, "ReferencedFrameOfReferenceUID", where=path.name)
         named_masks.check_frame_of_reference(frame, ct, path)
-        found[roi] = dicom_file.text(item, "ROIName", where=path.name)
-    return found
+        names[roi] = dicom_file.text(item, "ROIName", where=path.name)
+    return names
 
 
 def _regions(data: Dataset, names: dict[int, str], grid: VolumeGrid, path: Path) -> dict[int, _Region]:
-    found: dict[int, _Region] = {}
+    regions: dict[int, _Region] = {}
     if "ROIContourSequence" not in data:
         what = f"{dicom_file.name('ROIContourSequence')} is missing: was the file cut?"
         refuse(what, path, "contours", "missing_tag")
     T_index_ct = np.asarray(np.linalg.inv(grid.T_ct_index), np.float64)
     for item in dicom_file.items(data, "ROIContourSequence", where=path.name):
         roi = dicom_file.whole(item, "ReferencedROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
-        if roi not in names or roi in found:
-            what = f"contours of region {roi}, which is {'listed twice' if roi in found else 'not listed'}"
+        if roi not in names or roi in regions:
+            what = f"contours of region {roi}, which is {'listed twice' if roi in regions else 'not listed'}"
             refuse(what, path, "one list of contours for each region", "unknown_region")
         label = f"{path.name}, {names[roi]!r}"
         listed = dicom_file.items(item, "ContourSequence", where=label)
         closed = [one for one in listed if dicom_file.text(one, "ContourGeometricType", where=label) in CLOSED]
         contours = tuple(_contour(one, T_index_ct, grid, label) for one in closed)
-        found[roi] = _Region(contours, len(listed) - len(closed))
-    return {roi: found.get(roi, _Region((), 0)) for roi in names}
+        regions[roi] = _Region(contours, len(listed) - len(closed))
+    return {roi: regions.get(roi, _Region((), 0)) for roi in names}
 
 
 def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) -> Contour:
@@ -146,17 +146,17 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
 
 
 def _mask(contours: tuple[Contour, ...], grid: VolumeGrid) -> named_masks.Mask:
-    made = np.zeros(grid.shape, np.uint8, order="F")
+    mask = np.zeros(grid.shape, np.uint8, order="F")
     for number in {one.slice for one in contours}:
-        made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], grid.shape[:2])
+        mask[:, :, number] = _slice_mask([one for one in contours if one.slice == number], grid.shape[:2])
     # Whether at least three slices have contours, all at one distance of several slices
     steps = {above - below for below, above in itertools.pairwise(_slices(contours))}
     even = len(_slices(contours)) > 2 and len(steps) == 1 and steps != {1}
     for below, above in _gaps(contours):
         near = LEAN * (above - below) * grid.spacing_mm[2] / grid.spacing_mm[:2]
-        between = _between(made[:, :, below] > 0, made[:, :, above] > 0, near, even=even)
-        made[:, :, below + 1 : above] = between[:, :, None]
-    return made
+        between = _between(mask[:, :, below] > 0, mask[:, :, above] > 0, near, even=even)
+        mask[:, :, below + 1 : above] = between[:, :, None]
+    return mask
 
 
 def _between(below: Bools, above: Bools, near: Floats, *, even: bool) -> Bools:
@@ -168,7 +168,7 @@ def _between(below: Bools, above: Bools, near: Floats, *, even: bool) -> Bools:
     overlap = bool((below & above).any())
     if even and not overlap:
         return np.asarray(convex_hull_image(below | above))
-    made = below | above if overlap else np.zeros_like(below)
+    between = below | above if overlap else np.zeros_like(below)
     lower, upper = _parts(below), _parts(above)
     for number, (low, high) in enumerate(zip(lower.low, lower.high, strict=True), start=1):
         apart = np.maximum(np.maximum(upper.low - high, low - upper.high), 0)
@@ -177,8 +177,8 @@ def _between(below: Bools, above: Bools, near: Floats, *, even: bool) -> Bools:
             box = slice(first[0], last[0] + 1), slice(first[1], last[1] + 1)
             one, other = lower.numbers[box] == number, upper.numbers[box] == k + 1
             if np.count_nonzero(one & other) < OVERLAP * min(np.count_nonzero(one), np.count_nonzero(other)):
-                made[box] |= convex_hull_image(one | other)
-    return made
+                between[box] |= convex_hull_image(one | other)
+    return between
 
 
 class _Parts(NamedTuple):
@@ -221,8 +221,8 @@ def _narrow_parts(points: Floats, filled: Bools) -> Bools:
     at = at[((at >= 0) & (at < filled.shape)).all(axis=1)]
     passed = np.zeros_like(filled)
     passed[at[:, 0], at[:, 1]] = True
-    wide = scipy.ndimage.binary_opening(filled, np.ones((2, 2)))
-    return passed & grown(passed & ~grown(wide))
+    opened = scipy.ndimage.binary_opening(filled, np.ones((2, 2)))
+    return passed & grown(passed & ~grown(opened))
 
 
 def grown(pixels: Bools) -> Bools:
@@ -279,6 +279,6 @@ def polygon_fill(points: Floats, shape: tuple[int, int]) -> Bools:
     j = np.arange(len(edge)) - np.repeat(np.cumsum(crossed) - crossed - first, crossed)
     slope = (high[edge, 0] - low[edge, 0]) / (high[edge, 1] - low[edge, 1])
     i = np.clip(np.ceil(low[edge, 0] + (j - low[edge, 1]) * slope), 0, ni).astype(int)
-    turn = np.where(down[edge, 0], -1.0, 1.0)
-    crossings = np.bincount(i * nj + j, turn, minlength=(ni + 1) * nj).reshape(ni + 1, nj)
+    winding = np.where(down[edge, 0], -1.0, 1.0)
+    crossings = np.bincount(i * nj + j, winding, minlength=(ni + 1) * nj).reshape(ni + 1, nj)
     return np.asarray(np.cumsum(crossings[:ni], axis=0) != 0)

@@ -24,7 +24,7 @@ from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, Vol
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
 """Endings of files that are masks."""
 READ = ", ".join((*MASK_ENDINGS, *MESH_SUFFIXES, "DICOM"))
-"""What structures may be read from."""
+"""Kinds of files from which structures are read."""
 MAX_MASKS, MAX_ENTRIES = 1000, 60_000
 """TotalSegmentator has 117 classes; the slices of a CT may lie next to them."""
 SAME_PLACE_MM = 0.1
@@ -51,10 +51,10 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one per structure"
     if not is_folder(folder):
         refuse(f"'{folder.name[:200]}' is not a folder", where, allowed, "not_a_folder")
-    found = entries(folder, most=MAX_ENTRIES, allowed=allowed)
-    masks = [one.name for one in found if one.what == FILE and one.name.lower().endswith(MASK_ENDINGS)]
+    listed = entries(folder, most=MAX_ENTRIES, allowed=allowed)
+    masks = [one.name for one in listed if one.what == FILE and one.name.lower().endswith(MASK_ENDINGS)]
     files = [name for name in masks if not known(folder / name)]
-    left = unaccounted(folder, found, lambda path: path.name in files or known(path))
+    left = unaccounted(folder, listed, lambda path: path.name in files or known(path))
     if left:
         raise not_read(left, "masks", where)
     if not 1 <= len(files) <= MAX_MASKS:
@@ -73,7 +73,7 @@ def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
 
 
 def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
-    """Entries of a folder of masks or meshes that would be passed over: their organs would count as free."""
+    """Entries of a folder of masks or meshes that are not read: their organs would count as free."""
     return InputError(
         f"the folder also has files that cannot be read and may be organs: {first_few([one.line for one in left])}",
         where=where,
@@ -123,11 +123,11 @@ def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
         refuse(f"its voxels are in {header.data_path.name}", path, "header and voxels in one file", "data_elsewhere")
     if header.cells.dtype.kind not in "iu":
         refuse(f"voxels of type {header.cells.dtype}", path, "whole numbers", "wrong_type")
-    found = listed_segments(header.fields, header.layers, path)
-    listed = frozenset(found.values())
+    segments = listed_segments(header.fields, header.layers, path)
+    listed = frozenset(segments.values())
     masks = {
         name: MaskVolume(path, (file,), (name,), header, partial(_mask, content, file, header, segment, listed))
-        for name, segment in found.items()
+        for name, segment in segments.items()
     }
     return NamedMasks(masks, header.notes)
 

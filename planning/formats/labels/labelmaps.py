@@ -59,9 +59,9 @@ class LabelEnds(NamedTuple):
     last: NDArray[np.int64]  # shape (n, 3, 2), its first and last slice
     flat_mm2: NDArray[np.float64]  # shape (n, 3, 2), the area of that slice where the label ends flat, else 0
 
-    def only(self, kept: Bools) -> "LabelEnds":
+    def only(self, selected: Bools) -> "LabelEnds":
         """Those of some labels, given by a mask (n,)."""
-        return LabelEnds(self.last[kept], self.flat_mm2[kept])
+        return LabelEnds(self.last[selected], self.flat_mm2[selected])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +83,8 @@ class LabelMap:
     @cached_property
     def boxes(self) -> dict[int, Box]:
         """The smallest index box around each label present."""
-        found = scipy.ndimage.find_objects(self.labels.T)  # as it lies in a file: the first index runs fastest
-        return {label: box[::-1] for label, box in enumerate(found, start=1) if box is not None}
+        slices = scipy.ndimage.find_objects(self.labels.T)  # as it lies in a file: the first index runs fastest
+        return {label: box[::-1] for label, box in enumerate(slices, start=1) if box is not None}
 
     def labels_present(self) -> tuple[int, ...]:
         """The labels that at least one voxel has, rising, without the background."""
@@ -174,13 +174,13 @@ def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict
 
 
 def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -> Segment:
-    found = []
+    fields = []
     for key in (f"Segment{number}_LabelValue", f"Segment{number}_Layer"):
         text = remarks.get(key, "0" if layers == 1 and key.endswith("Layer") else None)
         if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
             refuse(f"{key} is {'missing' if text is None else repr(text[:20])}", path, ALLOWED_SEGMENTS, "bad_value")
-        found.append(int(text))
-    label, layer = found
+        fields.append(int(text))
+    label, layer = fields
     if not (1 <= label <= MAX_LABEL and layer < layers):
         allowed = f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}"
         refuse(f"segment {number} has label {label} in layer {layer}", path, allowed, "out_of_range")
@@ -246,8 +246,8 @@ def framed_surface(
     for axis in range(3):
         planes = np.moveaxis(framed, axis, 0)
         planes[0], planes[-1] = -np.abs(planes[1]), -np.abs(planes[-2])
-    found = marching_cubes(framed, level=0.0, method="lorensen", gradient_direction="ascent")
-    index, faces = found[0].astype(np.float64) - 1.0 + first, found[1]
+    surface = marching_cubes(framed, level=0.0, method="lorensen", gradient_direction="ascent")
+    index, faces = surface[0].astype(np.float64) - 1.0 + first, surface[1]
     return guard_mesh(apply(T_ct_index, index), faces, where=where)
 
 

@@ -23,7 +23,7 @@ _GLB_ALLOWED = "glTF, version 2: its length, then a JSON chunk and at most one B
 _DOCUMENT_ALLOWED = "a glTF 2.0 document in JSON"
 _JSON_CHUNK, _BIN_CHUNK = b"JSON", b"BIN\0"
 TRIANGLES = 4
-"""Mode of a primitive: separate triangles."""
+"""Mode of a primitive of separate triangles."""
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
 """Required extensions with these beginnings change colours only, not the surface."""
 _INSTANCING = "EXT_mesh_gpu_instancing"
@@ -100,7 +100,7 @@ class Node(_Properties):
 
 
 class Scene(_Properties):
-    """The nodes at the top."""
+    """The root nodes of a scene."""
 
     nodes: Annotated[list[Index], Field(max_length=MAX_NODES)] = []
 
@@ -233,11 +233,11 @@ class _Glb:
         number = self.document.scene or 0
         if number >= len(scenes):
             refuse(f"scene {number} of {len(scenes)}", self.where, _TREE_ALLOWED, "index_out_of_range")
-        found: dict[int, Floats] = {}
+        placed: dict[int, Floats] = {}
         waiting = [(index, np.eye(4)) for index in scenes[number].nodes]
         while waiting:
             index, T_scene_parent = waiting.pop()
-            if index >= len(nodes) or index in found:
+            if index >= len(nodes) or index in placed:
                 refuse(f"node {index} is missing or used twice", self.where, _TREE_ALLOWED, "not_a_tree")
             node, where = nodes[index], f"{self.where}, node {index}"
             allowed = "an invertible affine transform with last row 0 0 0 1"
@@ -253,16 +253,16 @@ class _Glb:
             if not np.isfinite(determinant) or determinant == 0.0 or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
                 what = f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}"
                 refuse(what, where, allowed, "not_invertible")
-            found[index] = T_scene_parent @ T
-            waiting.extend((child, found[index]) for child in node.children)
-        return found
+            placed[index] = T_scene_parent @ T
+            waiting.extend((child, placed[index]) for child in node.children)
+        return placed
 
     def check_total(self, placed: list[int]) -> None:
-        """Count before building: a small file may place one large mesh many times, or name one array in many parts."""
+        """Refuse too much before building: a small file may place a mesh many times, or an array in many parts."""
 
         def count(accessor: int | None) -> int:  # the reader refuses one that is not there by its name
-            found = self.document.accessors[accessor : accessor + 1] if accessor is not None else []
-            return found[0].count if found else 0
+            accessors = self.document.accessors[accessor : accessor + 1] if accessor is not None else []
+            return accessors[0].count if accessors else 0
 
         number_of_parts = sum(len(self.document.meshes[mesh].primitives) for mesh in placed)
         if number_of_parts > MAX_PARTS:

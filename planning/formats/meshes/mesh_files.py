@@ -141,11 +141,11 @@ def _read_ascii(data: bytes, where: str) -> RawMesh:
         refuse("several solids: a truncated file could lose some", where, _ASCII_ALLOWED, "several_solids")
     if len(tokens) == 0:
         refuse("the solid has no facet", where, _ASCII_ALLOWED, "empty")
-    for at, found in enumerate(tokens):
+    for at, word in enumerate(tokens):
         facet, place = divmod(at, _TOKENS_PER_FACET)
-        keyword = _KEYWORDS.get(place, found)
-        if found != keyword:
-            refuse(f"facet {facet}: {found[:20]!r} instead of {keyword!r}", where, _ASCII_ALLOWED, "unknown_line")
+        keyword = _KEYWORDS.get(place, word)
+        if word != keyword:
+            refuse(f"facet {facet}: {word[:20]!r} instead of {keyword!r}", where, _ASCII_ALLOWED, "unknown_line")
     if len(tokens) % _TOKENS_PER_FACET:
         refuse(f"facet {len(tokens) // _TOKENS_PER_FACET} is not complete", where, _ASCII_ALLOWED, "file_cut")
     columns = [tokens[column::_TOKENS_PER_FACET] for column in _COORDINATE_TOKENS]
@@ -233,8 +233,8 @@ def parse_mesh(
 
 
 def _stated_space(data: bytes) -> Space | None:
-    found = _STATEMENT.search(data[:_STATEMENT_BYTES])
-    return None if found is None else Space(found[1].decode())
+    match = _STATEMENT.search(data[:_STATEMENT_BYTES])
+    return None if match is None else Space(match[1].decode())
 
 
 class MeshExtent(NamedTuple):
@@ -290,7 +290,7 @@ def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tu
     """
     made_from = {"what": "mesh warnings", "meshes": [(name, mesh.digest) for name, mesh in meshes.items()]}
 
-    def found() -> Arrays:
+    def checked() -> Arrays:
         lines = [line for name, mesh in meshes.items() for line in mesh_warnings(mesh, name)]
         facts = [(mesh.closed, mesh.wound_alike) for mesh in meshes.values()]
         return {"lines": np.array(lines, np.str_), "facts": np.array(facts, np.bool_).reshape(-1, 2)}
@@ -300,7 +300,7 @@ def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tu
         if lines.dtype.kind != "U" or lines.ndim != 1 or facts.dtype != np.bool_ or facts.shape != (len(meshes), 2):
             raise ValueError("no lines, or not of these meshes")
 
-    cached = cache.arrays(made_from, found, by=__name__, check=check)
+    cached = cache.arrays(made_from, checked, by=__name__, check=check)
     for mesh, (closed, wound_alike) in zip(meshes.values(), cached["facts"].tolist(), strict=True):
         mesh.known(closed=closed, wound_alike=wound_alike)
     return tuple(cached["lines"].tolist())

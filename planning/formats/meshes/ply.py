@@ -1,4 +1,4 @@
-"""PLY, ASCII and binary of both byte orders: as many vertices and faces as the header states, or an error; and written.
+"""PLY, ASCII and binary of both byte orders: as many vertices and faces as the header states, or an error.
 
 The numbers of an ASCII file are turned into a binary body of doubles, so that one reader serves both forms.
 Source: G. Turk, "The PLY Polygon File Format", 1994.
@@ -133,7 +133,7 @@ def _elements(lines: list[list[str]], order: str, *, is_ascii: bool, where: str)
 
 @dataclass
 class _Cursor:
-    """Takes element after element from the body."""
+    """Reader that takes element after element from the body."""
 
     body: bytes
     where: str

@@ -22,7 +22,7 @@ _TYPES = {
     "unsigned_int": ">u4", "int": ">i4", "unsigned_long": ">u8", "long": ">i8", "vtkidtype": ">i4",
     "vtktypeint64": ">i8", "vtktypeuint64": ">u8", "float": ">f4", "double": ">f8",
 }  # fmt: skip
-"""By their names in lower case, as stored in a binary file."""
+"""Number types by their names in lower case, as stored in a binary file."""
 _SURFACES = ("POLYGONS", "TRIANGLE_STRIPS")
 _CELLS = ("VERTICES", "LINES", *_SURFACES)
 _NOTES = ("METADATA", "INFORMATION")
@@ -111,7 +111,7 @@ def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _
 
 
 def _pass_over(cursor: _Cursor, words: list[str], where: str) -> None:
-    """A field of arrays."""
+    """Skip a field of arrays."""
     for _ in range(_count(words, 2, 1000, where)):
         array = cursor.words()
         if len(array) != 4:
@@ -132,7 +132,7 @@ def _count(words: list[str], index: int, most: int, where: str) -> int:
 
 
 class _Cursor:
-    """Reads lines and numbers, one after the other, and never beyond the end."""
+    """Reader of lines and numbers, one after the other, and never beyond the end."""
 
     def __init__(self, data: bytes, where: str) -> None:
         self._data, self._where, self._at = data, where, 0

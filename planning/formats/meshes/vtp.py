@@ -129,10 +129,10 @@ def _values(piece: ElementTree.Element, path: str, count: int, encoding: Encodin
 
 
 def _one(piece: ElementTree.Element, path: str, where: str) -> ElementTree.Element:
-    found = piece.findall(path)
-    if len(found) != 1:
-        refuse(f"{len(found)} arrays {path}", where, "exactly one", "wrong_count")
-    return found[0]
+    elements = piece.findall(path)
+    if len(elements) != 1:
+        refuse(f"{len(elements)} arrays {path}", where, "exactly one", "wrong_count")
+    return elements[0]
 
 
 def _stated(piece: ElementTree.Element, name: str, where: str) -> int:
@@ -203,7 +203,7 @@ def _from_text(text: str, dtype: np.dtype[Any], where: str) -> NDArray[Any]:
 
 
 def _from_binary(stream: _Stream, size: int, encoding: Encoding, where: str) -> bytes:
-    """Header: the size; of blocks their number, the size of one, of the last if it is partial, and each compressed."""
+    """Bytes of an array. Header: size, or number and size of blocks, of a partial last one, of each compressed."""
     header_type, step = encoding.header_type, encoding.header_type.itemsize
     first = int(np.frombuffer(_take(stream, 0, step, where), header_type)[0])
     if encoding.compressed:

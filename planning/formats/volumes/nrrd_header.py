@@ -87,7 +87,7 @@ def stated_field(fields: dict[str, str], key: str, path: Path) -> str:
 
 
 def whole_number(text: str, path: Path) -> int:
-    """A count."""
+    """A field's text as a count."""
     if not (text.isascii() and text.isdigit() and len(text) < 19):
         refuse(f"size {text[:30]!r}", path, "positive whole numbers", "not_whole")
     return int(text)

@@ -73,10 +73,10 @@ def read_volume(path: Path) -> Volume:
         refuse(f"the file {absence(path)}", path, "a volume file", "no_such_file")
     _parser(path)  # an unknown ending is refused before anything is read
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-    beside = data_file(content, path)
-    if beside is None:
+    adjacent = data_file(content, path)
+    if adjacent is None:
         return parse_volume(content, path)
-    data_path = path.with_name(beside)
+    data_path = path.with_name(adjacent)
     return parse_volume(content, path, read_input(data_path, max_bytes=MAX_FILE_BYTES, where=str(data_path)))
 
 
@@ -105,12 +105,12 @@ def _scaled(stored: NDArray[Any], cells: volume_header.VoxelLayout) -> NDArray[A
     """Stored values times the slope plus the intercept; of integers that makes single precision, as SimpleITK does."""
     if abs(cells.slope - 1.0) <= SCALING_ROUNDING and abs(cells.intercept) <= SCALING_ROUNDING:
         return stored
-    kept = np.dtype(np.float64 if stored.dtype == np.float64 else np.float32)
+    precision = np.dtype(np.float64 if stored.dtype == np.float64 else np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
-        scaled = stored.astype(kept).astype(np.float64)
+        scaled = stored.astype(precision).astype(np.float64)
         scaled *= cells.slope
         scaled += cells.intercept
-        return scaled.astype(kept)
+        return scaled.astype(precision)
 
 
 Content = Callable[[str], bytes]
@@ -185,12 +185,12 @@ TILE = (32, 64)
 
 def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
     """A copy of values (nx, ny, nz), in any order, that lies in memory in that of its axes, the last one fastest."""
-    found = np.empty(values.shape, dtype)
+    ordered = np.empty(values.shape, dtype)
     for k in range(0, values.shape[2], TILE[0]):
         for j in range(0, values.shape[1], TILE[1]):
             tile = (slice(None), slice(j, j + TILE[1]), slice(k, k + TILE[0]))
-            found[tile] = values[tile]
-    return found
+            ordered[tile] = values[tile]
+    return ordered
 
 
 def canonical(values: NDArray[Any], T_ct_index: NDArray[np.float64]) -> Oriented:

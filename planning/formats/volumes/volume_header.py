@@ -20,7 +20,7 @@ MIN_SPACING_MM, MAX_SPACING_MM = 0.05, 20.0
 SHEAR_TOLERANCE = 1e-4
 """Largest cosine between two axes; ITK accepts no more, and float32 headers stay below 1e-6."""
 ONE_PLACE_MM = 1.0
-"""Nearer to each other two volumes are taken to lie at one place."""
+"""Distance below which two volumes are taken to lie at one place."""
 MAX_ORIGIN_MM = 100_000.0
 """No scanner places a patient 100 m from its own origin."""
 
@@ -39,7 +39,7 @@ class VoxelLayout:
 
 @dataclass(frozen=True, eq=False)
 class VolumeGrid:
-    """Where the voxels of a volume lie; what they hold has not been looked at."""
+    """Grid of a volume's voxels in space; their values have not been read."""
 
     shape: tuple[int, int, int]  # voxels along i, j, k
     T_ct_index: NDArray[np.float64]  # shape (4, 4), maps voxel index (i, j, k) to LPS mm
@@ -47,7 +47,7 @@ class VolumeGrid:
 
     @property
     def count(self) -> int:
-        """Voxels in all."""
+        """Number of voxels."""
         return self.shape[0] * self.shape[1] * self.shape[2]
 
     @property
@@ -55,7 +55,7 @@ class VolumeGrid:
         """Distance of neighbouring voxels along i, j and k, shape (3,)."""
         return np.asarray(np.linalg.norm(self.T_ct_index[:3, :3], axis=0))
 
-    def holds(self, point_ct: NDArray[np.float64]) -> bool:
+    def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in a voxel."""
         index = np.linalg.solve(self.T_ct_index, np.append(point_ct, 1.0))[:3]
         return bool(np.all((index >= -0.5) & (index <= np.array(self.shape) - 0.5)))
@@ -114,7 +114,7 @@ def corner_deviation_mm(T_a: NDArray[np.float64], T_b: NDArray[np.float64], shap
 
 
 def _corners(shape: tuple[int, int, int]) -> NDArray[np.float64]:
-    """Shape (8, 3)."""
+    """The corners of a volume, shape (8, 3), mm."""
     return np.array(list(itertools.product(*((0, n - 1) for n in shape))), dtype=np.float64)
 
 
@@ -144,7 +144,7 @@ DEFLATE_RATIO = 1033
 GZIP_WINDOW = 16 + zlib.MAX_WBITS
 """Tells zlib to expect gzip's header and check sum."""
 PART_BYTES = 1 << 20
-"""As much is read, and made, at a time."""
+"""Bytes that are read, and made, at a time."""
 
 
 def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.uint8]:
@@ -156,18 +156,18 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
     if promised > len(content) * DEFLATE_RATIO:
         what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header states"
         refuse(what, where, "a complete file", "size_mismatch")
-    found = np.empty(promised, np.uint8)
+    cells = np.empty(promised, np.uint8)
     count = 0
     try:
         for part in _parts(content, promised + 1):
             if count + len(part) <= promised:
-                found[count : count + len(part)] = np.frombuffer(part, np.uint8)
+                cells[count : count + len(part)] = np.frombuffer(part, np.uint8)
             count += len(part)
     except (EOFError, zlib.error) as error:
         what = f"the compressed data are damaged or cut short after {count} of {promised} bytes ({error})"
         raise InputError(what, where=where, allowed="a complete gzip file", code="file_damaged") from error
     check_exact_size(count, promised, where=where)
-    return found
+    return cells
 
 
 def first_bytes(content: memoryview, count: int, *, where: Path, allowed: str) -> bytes:
