@@ -43,7 +43,7 @@ from puncture_twin.twin.report.progress import progress_display
 if TYPE_CHECKING:
     from puncture_twin.planning.search.choice import Choice
 
-MOST_SEEDS = 10_000  # rooms or draws of one command; each takes seconds
+MOST_SEEDS = 10_000  # trials or draws of one command; each takes seconds
 app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
@@ -76,8 +76,8 @@ def schema() -> None:
 
     from puncture_twin.planning.case.case_file import case_schema
 
-    found = case_schema()
-    finish("schema", found, found, json.dumps(found, indent=1), as_json=False)
+    document = case_schema()
+    finish("schema", document, document, json.dumps(document, indent=1), as_json=False)
 
 
 @app.command()
@@ -271,29 +271,29 @@ def rehearse(
     from puncture_twin.planning.budget.guidance import stepped, ways_of
     from puncture_twin.twin.jobs.experiment.sweep_job import sweep_case, sweep_end, sweep_text
     from puncture_twin.twin.jobs.patient import main_job
-    from puncture_twin.twin.jobs.patient.run import room_count
+    from puncture_twin.twin.jobs.patient.run import trial_count
 
-    ways = () if guidance is None else ways_of(guidance)
-    stepped(",".join(ways), steps)
-    rooms = room_count(seeds, physics, ways[0] if ways else None, steps)
+    guidances = () if guidance is None else ways_of(guidance)
+    stepped(",".join(guidances), steps)
+    trials = trial_count(seeds, physics, guidances[0] if guidances else None, steps)
     folder = out_folder(out_dir, source, "rehearse")
     if sweep or to is not None:
-        end = sweep_end(source, to, sweep=sweep, alone=rooms is None and case is None)
+        end = sweep_end(source, to, sweep=sweep, alone=trials is None and case is None)
         with prepared(source) as context:
             swept = sweep_case(context, folder, choice, end)
         finish("rehearse --sweep", swept, swept.summary(), sweep_text(swept), as_json)
         return
     with prepared(main_job.rehearsed_case(source, case, choice)) as context:
-        if rooms is not None and len(ways) > 1:
-            from puncture_twin.twin.jobs.patient.ways_job import ways_job
+        if trials is not None and len(guidances) > 1:
+            from puncture_twin.twin.jobs.patient.guidance_job import compare_guidance
 
-            compared = ways_job(context, source, folder, ways, rooms.rooms, choice)
+            compared = compare_guidance(context, source, folder, guidances, trials.trials, choice)
             finish("rehearse --guidance A,B", compared, compared.summary(), compared.text(), as_json)
             return
         if main_job.is_plan(source):
-            run = main_job.rehearse_plan(context, source, folder, rooms)
+            run = main_job.rehearse_plan(context, source, folder, trials)
         else:
-            run = main_job.rehearse_case(context, folder, rooms, choice)
+            run = main_job.rehearse_case(context, folder, trials, choice)
     finish("rehearse", run, run.summary(), run.text(), as_json)
 
 
@@ -343,8 +343,8 @@ def touch(
         from puncture_twin.twin.jobs.live.mirror import LedArm, connect, led_text, refuse_of_twin, touch_by_hand
 
         refuse_of_twin(choice, seed)
-        told, arm = load_case(case), LedArm(connect(host, "touch --host"))
-        read = touch_by_hand(told, arm, _led_to, out_folder(out_dir, case, "touch"))
+        loaded, arm = load_case(case), LedArm(connect(host, "touch --host"))
+        read = touch_by_hand(loaded, arm, _led_to, out_folder(out_dir, case, "touch"))
         finish("touch", read, read.summary(), led_text(read), as_json)
         return
     require_extra("twin", "touch")
@@ -392,7 +392,7 @@ def pivot(
     place, folder = pivot_job.parse_place(at), out_folder(out_dir, case, "pivot")
     with prepared(case) as context:
         run = pivot_job.pivot_tour(context, folder, 8 if poses is None else poses, place, seed or 0)
-    finish("pivot", run.found, run.summary(), pivot_job.pivot_tour_text(run), as_json)
+    finish("pivot", run.calibration, run.summary(), pivot_job.pivot_tour_text(run), as_json)
 
 
 @app.command()
@@ -566,9 +566,9 @@ def _hand_eye(
     from puncture_twin.twin.jobs.patient.answers import hand_eye_summary, hand_eye_text, parse_noise
 
     pairs = read_pose_pairs(recording, motions=motions)
-    found = calibrate_hand_eye(pairs, parse_noise(noise))
-    summary = hand_eye_summary(found)
-    finish("calibrate hand-eye", found, summary, hand_eye_text(summary), as_json)
+    calibration = calibrate_hand_eye(pairs, parse_noise(noise))
+    summary = hand_eye_summary(calibration)
+    finish("calibrate hand-eye", calibration, summary, hand_eye_text(summary), as_json)
 
 
 @calibrate_app.command("dynamics")
@@ -586,8 +586,8 @@ def _dynamics(
     from puncture_twin.twin.jobs.experiment.dynamics_job import calibrate_dynamics, recorded_or_given
 
     with prepared(case, arm=True) as context:
-        found = calibrate_dynamics(context, recorded_or_given(context, recording, record, seed))
-    finish("calibrate dynamics", found, found.summary(), found.text(), as_json)
+        dynamics = calibrate_dynamics(context, recorded_or_given(context, recording, record, seed))
+    finish("calibrate dynamics", dynamics, dynamics.summary(), dynamics.text(), as_json)
 
 
 @app.command()

@@ -54,7 +54,7 @@ def line(path: Path, seconds: float | None, out: Path) -> str:
     """One search."""
     watched, began = Watched(), time.perf_counter()
     context = prepare(path, arm=False, watcher=watched)
-    found = place_case(context, out, quick_s=seconds, began=began, pictures=False).found
+    found = place_case(context, out, quick_s=seconds, began=began, pictures=False).search
     end = time.perf_counter()
     case, best = context.case, found.rated[0]
     candidates = organ_candidates(case, context.anatomy, context.engine, case.directions())

@@ -30,7 +30,7 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import pose_error
-from puncture_twin.twin.jobs.patient.ways_job import COLOURS, rated
+from puncture_twin.twin.jobs.patient.guidance_job import COLOURS, rated
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.report.error_pictures import draw_clouds
 
@@ -159,7 +159,7 @@ def main() -> None:
         print(f"{way:10s} {', '.join(f'{name} {100 * part:.0f} %' for name, part in parts if part >= 0.05)}")
         for lost in found.hidden:
             print(f"{'':10s} {lost}")
-    drawn = [(one.found, one.rating, COLOURS[one.rating]) for one in rated(list(shown.values()))]
+    drawn = [(one.distribution, one.rating, COLOURS[one.rating]) for one in rated(list(shown.values()))]
     draw_clouds(drawn, plan.outward_ct, stated.picture, HIT_MM, columns=4)
 
 

@@ -552,9 +552,9 @@ def rehearse(
 
     require_extra("twin", "rehearse")
     from puncture_twin.twin.jobs.patient.rehearsed import rehearse_once
-    from puncture_twin.twin.jobs.patient.run import room_count
+    from puncture_twin.twin.jobs.patient.run import trial_count
 
-    rooms = room_count(seeds, physics, guidance, steps)
+    rooms = trial_count(seeds, physics, guidance, steps)
     return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), rooms, seed)
 
 
@@ -647,7 +647,7 @@ def place(context: CaseContext, *, jobs: int = 2, quick_s: float | None = None) 
     """
     from puncture_twin.twin.jobs.patient.place_job import find_places, refuse_none
 
-    found = find_places(context, jobs, math.inf if quick_s is None else time.perf_counter() + quick_s).found
+    found = find_places(context, jobs, math.inf if quick_s is None else time.perf_counter() + quick_s).search
     refuse_none(found)
     return found
 

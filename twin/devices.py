@@ -32,7 +32,7 @@ class Arm(Protocol):
         """Move to joints (6,), rad, and return when they are at rest."""
 
     def measured_jp(self) -> Floats:
-        """What the encoders say at rest, joints (6,), rad."""
+        """Joints (6,), rad, that the encoders read at rest."""
 
 
 class Cameras(Protocol):
@@ -53,7 +53,7 @@ class Operator(Protocol):
     """A person who points at a marker in the images of both cameras."""
 
     def pointed_cp(self, marker: str) -> Floats:
-        """Where the marker is, roughly, shape (3,), mm, in the measuring arm's frame."""
+        """Rough position of the marker, shape (3,), mm, in the measuring arm's frame."""
 
 
 class Probe(Protocol):
@@ -77,7 +77,7 @@ class ControlScan(NamedTuple):
     frame: str = ""
     """Its frame of reference by the scanner's own name, as in DICOM; empty where it states none."""
     inputs: tuple[Input, ...] = ()
-    """Files that it was read from."""
+    """Files that the scan was read from."""
 
 
 class Scanner(Protocol):
@@ -92,7 +92,7 @@ class StoppedError(Exception):
 
 
 class Moved(NamedTuple):
-    """What an arm with a force sensor says of a motion."""
+    """Result of a motion of an arm with a force sensor."""
 
     q: Floats
     """Shape (6,), rad: encoders at its end."""

@@ -25,7 +25,7 @@ from puncture_twin.planning.formats.dicom.pixels import MAX_SIDE, check_length, 
 from puncture_twin.planning.formats.dicom.storage import META_START, is_dicom
 
 MAX_BYTES = 1_000_000_000
-"""Of one file: 2,000 frames of 800 x 600."""
+"""Most bytes of a file: 2,000 frames of 800 x 600."""
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 TWO_D, TISSUE, CENTIMETRES = 1, 1, 3
@@ -117,12 +117,12 @@ def _dicom_frames(
         down, along = numbers(data, "PixelSpacing", 2, where=where)
         spacing = (along, down)
     if spacing is not None and region_size is not None and not np.allclose(spacing, region_size, rtol=SAME_SIZE):
-        (across, down), (wide, high) = spacing, region_size
-        what = f"PixelSpacing {across:g} x {down:g} mm, but its region {wide:g} x {high:g} mm"
+        (across, down), (width, height) = spacing, region_size
+        what = f"PixelSpacing {across:g} x {down:g} mm, but its region {width:g} x {height:g} mm"
         refuse(what, where, "one size of a pixel", "pixel_size")
-    found = [_grey(cells[box]) for cells in decoded_frames(data, where, raw=False)]
-    grey = np.stack([one[0] for one in found]) if found else np.zeros((0, 1, 1), np.uint8)
-    coloured = np.stack([one[1] for one in found]) if found else np.zeros((0, 1, 1), bool)
+    frames = [_grey(cells[box]) for cells in decoded_frames(data, where, raw=False)]
+    grey = np.stack([one[0] for one in frames]) if frames else np.zeros((0, 1, 1), np.uint8)
+    coloured = np.stack([one[1] for one in frames]) if frames else np.zeros((0, 1, 1), bool)
     if len(grey) != count or grey.dtype != np.uint8:
         refuse(f"{len(grey)} frames of {grey.dtype}", where, f"{count} of 8 bits, as in its header", "size_mismatch")
     if coloured.mean() > MOST_COLOURED:

@@ -14,10 +14,10 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.budget.guidance import sight_of
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import OK
-from puncture_twin.twin.jobs.patient import ways_job as ways
+from puncture_twin.twin.jobs.patient import guidance_job as ways
 from puncture_twin.twin.jobs.patient.main_job import checked_plan
-from puncture_twin.twin.jobs.patient.rehearsed import in_rooms
-from puncture_twin.twin.jobs.patient.run import room_count
+from puncture_twin.twin.jobs.patient.rehearsed import case_distribution
+from puncture_twin.twin.jobs.patient.run import trial_count
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
 from puncture_twin.twin.report import patient
 
@@ -91,7 +91,7 @@ def test_sources_add_up(compared, plan):
     done, _ = ways._rehearsed(context, one_plan, ("ct", "us"), 20)
     *parts, whole = ways.Compared(context, one_plan, done, {}, ())._sources().rows
     for column, one in enumerate(done, start=1):
-        assert float(whole[column]) == pytest.approx(one.found.predicted_rms_mm, abs=0.006)
+        assert float(whole[column]) == pytest.approx(one.distribution.predicted_rms_mm, abs=0.006)
         assert sum(float(row[column]) ** 2 for row in parts) == pytest.approx(float(whole[column]) ** 2, rel=0.05)
 
 
@@ -121,13 +121,13 @@ def test_failing_is_worse_than_erring(plan, tmp_path):
     context, one_plan = plan
     (one, *_), _ = ways._rehearsed(context, one_plan, ("ct",), 200)
     kept = np.arange(200) < 60
-    found = one.found
+    found = one.distribution
     of_kept = {name: getattr(found, name)[kept] for name in ("hit", "touched", "in_region")}
     few = replace(found, stopped=140, trials=found.trials.of(kept), **of_kept)
     small = replace(few, trials=few.trials._replace(tip_ct=few.trials.target_ct + 0.01))
     first, second, last = ways.rated([small, found, found])
     assert (first.rating, second.rating, last.rating) == ("best", "as good", "worse")
-    assert last.why == "more trials fail" and last.failed >= 0.7 and last.found.stopped == 140
+    assert last.why == "more trials fail" and last.failed >= 0.7 and last.distribution.stopped == 140
     rest = np.zeros(60, bool)
     of_rest = {name: getattr(few, name)[rest] for name in ("hit", "touched", "in_region")}
     none = replace(few, stopped=200, trials=few.trials.of(rest), **of_rest)
@@ -139,11 +139,11 @@ def test_failing_is_worse_than_erring(plan, tmp_path):
 
 def test_a_plan_is_rehearsed_in_steps(plan):
     """Error, passes, dose and minutes beside the open loop, in the object and in the table of page and terminal."""
-    found = in_rooms(*plan, room_count(50, 0, "ct", 2)).summary()
+    found = case_distribution(*plan, trial_count(50, 0, "ct", 2)).summary()
     assert (found["steps"], found["passes"], found["scans"], found["dose_msv"]) == (2, 2.0, 2.0, 1.8)
     assert 4.0 < found["minutes"] == pytest.approx(4.0 + found["open_loop"]["minutes"])
     assert found["realised_rms_mm"] < found["open_loop"]["realised_rms_mm"]
-    shown = {row[0]: row[1] for row in patient.rooms(found)[0].rows}
+    shown = {row[0]: row[1] for row in patient.trials(found)[0].rows}
     assert shown["open loop: tip error, rms, mm"] == f"{found['open_loop']['realised_rms_mm']:.3f}"
     assert shown["control scans, and their dose, mSv"] == "2.00: 1.80"
 

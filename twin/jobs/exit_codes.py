@@ -1,4 +1,4 @@
-"""How a command ends: what it found, its exit code, and one line for what went wrong."""
+"""End of a command: its answer, its exit code, and one line for what went wrong."""
 
 import errno
 import sys
@@ -20,30 +20,30 @@ OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 1
 RULES: Mapping[str, Callable[[Any], bool]] = {
     "demo": lambda run: not run.failures,
     "search": lambda run: bool(run.candidates.safe.any()),
-    "check": lambda found: found.safe,
-    "compare": lambda found: found.safe,
+    "check": lambda answer: answer.safe,
+    "compare": lambda answer: answer.safe,
     "rehearse": lambda run: not run.failures,
     "rehearse --sweep": lambda run: run.whole,
-    "rehearse --guidance A,B": lambda found: found.passed,
+    "rehearse --guidance A,B": lambda answer: answer.passed,
     "touch": lambda run: run.suffices,
-    "pivot": lambda found: not found.pivot.large,
+    "pivot": lambda answer: not answer.pivot.large,
     "servo": lambda job: job.passed,
     "confirm": lambda done: done.yes,
     "reproduce": lambda result: result.passed,
     "batch run": lambda counts: counts.whole,
-    "batch merge": lambda found: found.as_expected,
+    "batch merge": lambda answer: answer.as_expected,
 }
-"""Whether what a command found is the answer yes, by its name; the others have no other. In words, where it is no:
+"""Whether a command's answer is yes, by the command's name; the others know no other. In words, where it is no:
 ``docs/reference/command-line.md``."""
 PrintLine = Callable[[str], None]  # shows one line, on stderr
 NUMBERS = {int: "a whole number", float: "a number"}
 
 
-def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print what a command found, and end it with the code that its rule gives, by `typer.Exit` where that is not 0."""
+def finish(command: str, answer: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print a command's answer, and end it with the code that its rule gives, by `typer.Exit` where that is not 0."""
     terminal.print_answer(summary, text, as_json)
-    if command in RULES and not RULES[command](found):
-        failed = command == "batch run" and found.ended[PROGRAM_FAILED] > 0
+    if command in RULES and not RULES[command](answer):
+        failed = command == "batch run" and answer.ended[PROGRAM_FAILED] > 0
         raise typer.Exit(PROGRAM_FAILED if failed else ANSWER_IS_NO)
 
 
@@ -90,7 +90,7 @@ def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json:
 
 
 def _unread(error: BaseException) -> int:
-    """The code where nobody reads stdout; a pipe that broke elsewhere, such as a worker's, is a failure."""
+    """Exit code where nobody reads stdout; a pipe that broke elsewhere, such as a worker's, is a failure."""
     if isinstance(error, SystemExit) and not error.code:  # typer has completed a shell's word, or said how
         return OK
     in_help = traceback.extract_tb(error.__traceback__)[-1].name == "on_broken_pipe"  # rich; stdout goes nowhere then
@@ -102,7 +102,7 @@ def _unread(error: BaseException) -> int:
 
 
 def _failed(error: Exception, print_line: PrintLine) -> int:
-    """What broke is shown whole, unless it is that stdout takes nothing, or a disk no more."""
+    """Exit code of a failure, shown whole unless stdout takes nothing or the disk is full."""
     why = terminal.refusal_of(sys.stdout) if isinstance(error, OSError) else None
     if why is not None:
         terminal.leave_unread(sys.stdout)

@@ -1,4 +1,4 @@
-"""What a person sees: lines on stdout that no width breaks, a reader who went away, and Ctrl-C that arrives.
+"""The terminal: lines on stdout that no width breaks, a reader who went away, and Ctrl-C that arrives.
 
 Python raises ``KeyboardInterrupt`` at whatever line runs when the signal comes. Where that line is called from a
 library's callback, a destructor or a lookup in C, or where a library catches whatever the import of another raises, the
@@ -33,7 +33,7 @@ millions, spends a fifth of its time in looking."""
 
 
 class Answer(NamedTuple):
-    """What a command found: yes or no, for the exit code; plain values, for ``--json``; and text for a person."""
+    """Answer of a command: yes or no, for the exit code; plain values, for ``--json``; and text for a person."""
 
     passed: bool
     summary: dict[str, Any]
@@ -53,7 +53,7 @@ def default_out(source: Path, command: str) -> Path:
 
 
 def print_answer(summary: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print what a command found: one JSON object, or the text for a person; nothing, where it was interrupted."""
+    """Print an answer: one JSON object, or the text for a person; nothing, where it was interrupted."""
     raise_dropped()
     sys.stdout.write((json.dumps(summary, allow_nan=False) if as_json else text) + "\n")
 
@@ -168,7 +168,7 @@ def _unbreakable(frame: FrameType | None) -> int:
 
 
 def _again(*_: object) -> None:
-    """By way of the signal: a block that puts Ctrl-C off, such as the renames of a folder, puts this off too."""
+    """Interrupt again by signal: a block that puts Ctrl-C off, such as the renames of a folder, puts this off too."""
     if not _is_handled():
         signal.raise_signal(signal.SIGINT)
 
@@ -182,7 +182,7 @@ def _is_handled() -> bool:
 
 
 def _silent(_: Any) -> None:
-    """In place of the traceback of an exception that nobody can catch."""
+    """Do nothing, in place of the traceback of an exception that nobody can catch."""
 
 
 def look_seldom() -> None:

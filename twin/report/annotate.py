@@ -1,4 +1,4 @@
-"""Words on pictures of pixels with Pillow, in matplotlib's own font: text with a rim, body axes, scale, legend."""
+"""Text on pixel pictures with Pillow, in matplotlib's own font: text with a rim, body axes, scale, legend."""
 
 from functools import cache
 from pathlib import Path
@@ -24,7 +24,7 @@ LEGEND_SIZE = 15  # pixels: a legend's letters and patches
 SCALE_BARS_MM = (5, 10, 20, 50, 100, 200, 500)
 Place = tuple[float, float]  # right and down, pixels
 Anchor = Literal["lm", "rm", "mm", "la", "ra", "ma", "lb", "mb", "ls", "rs", "ms"]
-"""Which point of a line of text stands at its place, as Pillow names it."""
+"""The point of a line of text that lies at its position, as Pillow names it."""
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Pictures of errors: by source and after a change; of the tips of many rooms; over the time of one rehearsal."""
+"""Pictures of errors: by source and after a change; of the tips of many trials; over the time of one rehearsal."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,7 +28,7 @@ CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")  # O
 
 
 def budget_figure(facts: Mapping[str, Any]) -> Figure:
-    """The picture of facts as ``register --json`` has them under ``budget``."""
+    """The figure of an error budget: facts as ``register --json`` has them under ``budget``."""
     inches = (WIDTH_INCHES, HEAD_INCHES + ROW_INCHES * max(LEAST_ROWS, len(facts["changes"])))
     figure = Figure(figsize=inches, dpi=DPI, facecolor="white", layout="constrained")
     sources, what_if = figure.subplots(1, 2)
@@ -76,7 +76,7 @@ def _plain(axes: Axes) -> None:
 
 FIGURE_INCHES, DISTRIBUTION_DPI = (17.2, 4.7), 110
 EDGES = {"left": 0.036, "right": 0.994, "bottom": 0.175, "top": 0.865, "wspace": 0.19}
-"""Of the four plots, in the picture: to find out what room their words need takes longer than to draw them."""
+"""Edges of the four plots in the picture: measuring the space of their labels takes longer than drawing them."""
 
 MOST_POINTS = 4000  # of a cloud: more hide one another
 WITHIN, BEYOND, PREDICTED = "#0072b2", "#d55e00", "#000000"  # Okabe and Ito's; what lies beyond is a cross too
@@ -87,23 +87,23 @@ LEVELS = np.linspace(0.05, 0.95, 19)  # chances at which rooms are counted: the 
 TWO_SIDED = 1.96  # standard errors that hold 95 % of what chance alone does
 
 
-def draw_rooms_picture(found: Any, path: Path) -> None:
-    """Write the picture, in the needle's frame: two axes across it, then depth."""
-    R = frame_about(-found.puncture.outward_ct).T
-    error, cov = found.error_ct @ R.T, R @ found.cov_ct @ R.T
+def draw_distribution(trials: Any, path: Path) -> None:
+    """Write the tip errors of trials, in the needle's frame: two axes across it, then depth."""
+    R = frame_about(-trials.puncture.outward_ct).T
+    error, cov = trials.error_ct @ R.T, R @ trials.cov_ct @ R.T
     figure = Figure(figsize=FIGURE_INCHES, dpi=DISTRIBUTION_DPI, facecolor="white")
     side, along, sizes, chances = figure.subplots(1, 4, gridspec_kw=dict(EDGES))
-    _cloud(side, error, cov, found.in_region, (0, 1), ("lateral x, mm", "lateral y, mm"))
+    _cloud(side, error, cov, trials.in_region, (0, 1), ("lateral x, mm", "lateral y, mm"))
     side.set_title("tip in the patient, seen along the needle", fontsize=10)
-    _cloud(along, error, cov, found.in_region, (0, 2), ("lateral x, mm", "depth, mm (down: too deep)"))
+    _cloud(along, error, cov, trials.in_region, (0, 2), ("lateral x, mm", "depth, mm (down: too deep)"))
     along.invert_yaxis()
     along.set_title("seen from the side", fontsize=10)
     figure.legend(*along.get_legend_handles_labels(), fontsize=7.5, loc="lower left", ncols=4)
-    _histogram(sizes, found)
-    _reliability(chances, found)
-    inside = f"{100 * found.in_region.mean():.1f} % inside the predicted 95 % ellipsoid"
-    rms = f"rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm"
-    figure.suptitle(f"{plural(len(found), 'trial')}, seed {found.seed}: {inside}; {rms}", fontsize=11.5)
+    _histogram(sizes, trials)
+    _reliability(chances, trials)
+    inside = f"{100 * trials.in_region.mean():.1f} % inside the predicted 95 % ellipsoid"
+    rms = f"rms {trials.realised_rms_mm:.2f} mm, predicted {trials.predicted_rms_mm:.2f} mm"
+    figure.suptitle(f"{plural(len(trials), 'trial')}, seed {trials.seed}: {inside}; {rms}", fontsize=11.5)
     write_png(figure, path)
 
 
@@ -128,44 +128,43 @@ def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int,
 
 
 def draw_clouds(
-    ways: Sequence[tuple[Any, str, str]], outward_ct: Floats, path: Path, hit_mm: float | None = None, columns: int = 2
+    rated: Sequence[tuple[Any, str, str]], outward_ct: Floats, path: Path, hit_mm: float | None = None, columns: int = 2
 ) -> None:
-    """Error clouds of ways of guidance, all to one scale, in the plane of the needle where they are widest.
+    """Write the error clouds of several guidances, all to one scale, in the plane of the needle where they are widest.
 
-    Of each way its trials, a word beside its name, and its colour; the needle's direction outward, (3,), unit; `hit_mm`
-    is the radius of a hit, drawn as a ring.
+    Of each guidance its trials, a word, its colour; `outward_ct`: of the needle, (3,), unit; `hit_mm`: radius of a hit.
     """
     R, reach = frame_about(-outward_ct).T, 0.0
-    widest = np.sum([R[:2] @ found.cov_ct @ R[:2].T for found, _, _ in ways], axis=0)
+    widest = np.sum([R[:2] @ one.cov_ct @ R[:2].T for one, _, _ in rated], axis=0)
     R[:2] = np.linalg.eigh(widest)[1].T[::-1] @ R[:2]
-    rows = -(-len(ways) // columns)  # two columns can still be read on a telephone
+    rows = -(-len(rated) // columns)  # two columns can still be read on a telephone
     size = (PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows)
     figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="compressed")
     panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-    for axes, (found, word, colour) in zip(panels, ways, strict=False):
-        _cloud(axes, found.error_ct @ R.T, R @ found.cov_ct @ R.T, found.in_region, (0, 2), ("", ""))
+    for axes, (one, word, colour) in zip(panels, rated, strict=False):
+        _cloud(axes, one.error_ct @ R.T, R @ one.cov_ct @ R.T, one.in_region, (0, 2), ("", ""))
         reach = max(reach, axes.get_xlim()[1])
         if hit_mm is not None:
             axes.add_patch(Circle((0, 0), hit_mm, fill=False, linestyle=":", edgecolor="0.3"))
-        said = f"{found.realised_rms_mm:.2f} mm rms, {100 * found.hit.mean():.1f} % hit" if len(found) else "none ended"
-        axes.set_title(f"{found.guidance}: {word}\n{said}", fontsize=10, color=colour)
+        end = f"{one.realised_rms_mm:.2f} mm rms, {100 * one.hit.mean():.1f} % hit" if len(one) else "none ended"
+        axes.set_title(f"{one.guidance}: {word}\n{end}", fontsize=10, color=colour)
         axes.spines[:].set(color=colour, linewidth=2.0)
     panels[0].set(xlim=(-reach, reach), ylim=(reach, -reach))
-    for axes in panels[len(ways) :]:
+    for axes in panels[len(rated) :]:
         axes.remove()
     figure.supxlabel("across the needle, where errors are widest, mm", fontsize=10)
     figure.supylabel("depth, mm (down: too deep)", fontsize=10)
     write_png(figure, path)
 
 
-def _histogram(axes: Axes, found: Any) -> None:
-    sizes = found.tip_error_mm
-    top = 1.02 * max(float(sizes.max()), 2.5 * found.predicted_rms_mm)
+def _histogram(axes: Axes, trials: Any) -> None:
+    sizes = trials.tip_error_mm
+    top = 1.02 * max(float(sizes.max()), 2.5 * trials.predicted_rms_mm)
     edges = np.linspace(0, top, BINS + 1)
     axes.hist(sizes, bins=list(edges), color=WITHIN, alpha=0.55, label="trials")
     fine = np.linspace(0, top, 4 * BINS + 1)
-    reached = np.array([hit_in_ball(found.cov_ct[None], radius)[0] if radius > 0 else 0.0 for radius in fine.tolist()])
-    density = np.diff(reached) * len(found) * 4
+    reached = np.array([hit_in_ball(trials.cov_ct[None], radius)[0] if radius > 0 else 0.0 for radius in fine.tolist()])
+    density = np.diff(reached) * len(trials) * 4
     axes.plot((fine[1:] + fine[:-1]) / 2, density, color=PREDICTED, lw=1.6, label="predicted")
     median = float(np.median(sizes))
     axes.axvline(median, color=BEYOND, ls="--", lw=1.5, label=f"median {median:.2f} mm")
@@ -174,18 +173,18 @@ def _histogram(axes: Axes, found: Any) -> None:
     axes.legend(fontsize=8)
 
 
-def _reliability(axes: Axes, found: Any) -> None:
-    """How often it happened over how often it was predicted: the tip within a radius, the target hit, each touch."""
-    sizes = np.sort(found.tip_error_mm)
-    radii = np.geomspace(0.02, 5.0, 400) * found.predicted_rms_mm
-    predicted = np.array([hit_in_ball(found.cov_ct[None], radius)[0] for radius in radii.tolist()])
-    within = np.searchsorted(sizes, np.interp(LEVELS, predicted, radii), side="right") / len(found)
+def _reliability(axes: Axes, trials: Any) -> None:
+    """Plot observed fractions over predicted chances: the tip within a radius, the target hit, each touch."""
+    sizes = np.sort(trials.tip_error_mm)
+    radii = np.geomspace(0.02, 5.0, 400) * trials.predicted_rms_mm
+    predicted = np.array([hit_in_ball(trials.cov_ct[None], radius)[0] for radius in radii.tolist()])
+    within = np.searchsorted(sizes, np.interp(LEVELS, predicted, radii), side="right") / len(trials)
     fine = np.linspace(0, 1, 101)
-    spread = TWO_SIDED * np.sqrt(fine * (1 - fine) / len(found))
+    spread = TWO_SIDED * np.sqrt(fine * (1 - fine) / len(trials))
     axes.fill_between(fine, fine - spread, fine + spread, color="0.85", lw=0, label="95 % range of chance alone")
     axes.plot([0, 1], [0, 1], color=PREDICTED, lw=1.0)
     axes.scatter(LEVELS, within, s=16, c=WITHIN, label="tip within a radius", zorder=3)
-    hits, touches = ([found.p_hit], [found.hit_share]), (found.p_touch, found.touched.mean(axis=0))
+    hits, touches = ([trials.p_hit], [trials.hit_share]), (trials.p_touch, trials.touched.mean(axis=0))
     axes.scatter(*hits, s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
     axes.scatter(*touches, s=26, c=BEYOND, marker="x", label="a structure touched", zorder=4)
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal")

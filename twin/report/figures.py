@@ -35,9 +35,9 @@ def halo(width: float, colour: str = "white") -> list[Any]:
 
 def picture_axes(figure: Figure, image: NDArray[np.uint8]) -> Axes:
     """Axes in pixels (right, down; 0 is the upper left corner) of an image, (h, w) or (h, w, 3), that fills them."""
-    axes, (high, wide) = figure.add_axes((0, 0, 1, 1)), image.shape[:2]
+    axes, (h, w) = figure.add_axes((0, 0, 1, 1)), image.shape[:2]
     axes.set_axis_off()
-    axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, wide, high, 0), interpolation="lanczos", aspect="auto")
+    axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, w, h, 0), interpolation="lanczos", aspect="auto")
     axes.set_autoscale_on(False)
     return axes
 

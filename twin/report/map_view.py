@@ -1,4 +1,4 @@
-"""How directions lie on the map: the cap seen from outside, θ as distance from the centre, β counter-clockwise.
+"""Projection of directions to the map: the cap seen from outside, θ as distance from the centre, β counter-clockwise.
 
 Who looks from outside along -z of the entry frame sees its z axis come out of the paper, and x, y right-handed: β runs
 counter-clockwise, with no mirroring. For a patient the map is turned so that the head is at the top where that is
@@ -37,7 +37,7 @@ class RimLabel(NamedTuple):
 
 @dataclass(frozen=True)
 class MapView:
-    """The map's geometry."""
+    """Geometry of the map: rotation, extent, labels of the rim and the centre."""
 
     turn: float  # angle on the picture, counter-clockwise from the right, at which β = 0 lies
     theta_max: float  # θ at the rim, rad
@@ -58,7 +58,7 @@ class MapView:
 
 
 def body_directions(space: str) -> dict[str, Floats]:
-    """Unit vectors in the CT frame and what to call them: the patient's, or the axes of a local frame."""
+    """Unit vectors in the CT frame by their names: the patient's, or the axes of a local frame."""
     if str(space) == "local":
         names = ((f"{sign}{axis}", i, s) for i, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("−", -1.0)))
         return {name: s * np.eye(3)[i] for name, i, s in names}
@@ -69,10 +69,10 @@ def map_view(case: Any, candidates: Candidates) -> MapView:
     """The view for a case: turned so that head (or front) is up, with its labels."""
     to_entry = np.asarray(case.T_ct_entry)[:3, :3].T
     vectors = {name: to_entry @ v for name, v in body_directions(case.space).items()}
-    turn = 0.0
+    rotation = 0.0
     for name in ("head", "front"):
         if name in vectors and np.hypot(*vectors[name][:2]) > IN_PLANE:
-            turn = np.pi / 2 - float(np.arctan2(vectors[name][1], vectors[name][0]))
+            rotation = np.pi / 2 - float(np.arctan2(vectors[name][1], vectors[name][0]))
             break
     theta_max = float(candidates.theta.max(initial=0.0)) + 0.5 * step_of(candidates)
     centre = max(vectors, key=lambda name: vectors[name][2])
@@ -83,13 +83,13 @@ def map_view(case: Any, candidates: Candidates) -> MapView:
         if np.sin(theta) < IN_PLANE:
             continue
         text = name if abs(theta - np.pi / 2) < np.radians(1.0) else f"{name} (θ {np.degrees(theta):.0f}°)"
-        angle = float(np.mod(beta + turn, 2 * np.pi))
-        near = [i for i, other in enumerate(rim) if abs(_turn_between(other.angle, angle)) < SAME_PLACE]
+        angle = float(np.mod(beta + rotation, 2 * np.pi))
+        near = [i for i, other in enumerate(rim) if abs(_angle_between(other.angle, angle)) < SAME_PLACE]
         if near:
             rim[near[0]] = RimLabel(f"{rim[near[0]].text} / {text}", rim[near[0]].angle)
         else:
             rim.append(RimLabel(text, angle))
-    return MapView(turn, theta_max, tuple(rim), centre if exact else "")
+    return MapView(rotation, theta_max, tuple(rim), centre if exact else "")
 
 
 def step_of(candidates: Candidates) -> float:
@@ -144,7 +144,7 @@ class MapCells:
         after = np.searchsorted(cells, ring * RING + beta)
         begin, end = self.starts[ring], self.starts[ring + 1]
         before, after = np.where(after > begin, after, end) - 1, np.where(after < end, after, begin)
-        ahead, behind = (np.abs(_turn_between(self.beta[one], beta)) for one in (after, before))
+        ahead, behind = (np.abs(_angle_between(self.beta[one], beta)) for one in (after, before))
         near = (np.minimum(ahead, behind) <= self.half_beta[ring]) & (np.abs(theta - heights[ring]) <= self.half_theta)
         return np.where(near, self.rows_in_order[np.where(ahead < behind, after, before)], -1)
 
@@ -154,5 +154,5 @@ class MapCells:
         return self.rows(*view.angles_at(np.stack(np.meshgrid(middles, -middles), axis=-1)))
 
 
-def _turn_between(a: Any, b: Any) -> Any:
+def _angle_between(a: Any, b: Any) -> Any:
     return np.mod(np.asarray(a) - b + np.pi, 2 * np.pi) - np.pi

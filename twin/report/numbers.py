@@ -1,4 +1,4 @@
-"""Words and numbers that both the pictures and the page print; directions and mounts in the patient's words."""
+"""Texts and numbers of pictures and page; directions and mounts in terms of the patient."""
 
 import math
 from dataclasses import dataclass
@@ -32,20 +32,20 @@ class ReasonCount:
 
 
 def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
-    """Safe first, then the reasons that occur, most frequent first."""
+    """Counts of the verdicts: safe first, then the reasons that occur, most frequent first."""
     weights = ring_weights(candidates.theta, step_of(candidates))
     lines: list[tuple[str, str, reasons.Rgb, Bools]] = []
     air = candidates.unseen_air
     for value in np.unique(candidates.verdict.reason):
-        here = (candidates.verdict.reason == value) & ~air
+        rows = (candidates.verdict.reason == value) & ~air
         reason = reasons.Reason(str(value))
         text = reasons.REASON_TEXT[reason] if reason else candidates.safe_text
-        lines.append((text, reason.value or "safe", reasons.REASON_COLOURS.get(reason, reasons.SAFE), here))
+        lines.append((text, reason.value or "safe", reasons.REASON_COLOURS.get(reason, reasons.SAFE), rows))
     lines.append((reasons.UNSEEN_AIR_TEXT, reasons.Reason.UNKNOWN_REGION.value, reasons.UNSEEN_AIR, air))
     counts = [
-        ReasonCount(text, code, colour, int(here.sum()), float(weights[here].sum() / weights.sum()))
-        for text, code, colour, here in lines
-        if here.any()
+        ReasonCount(text, code, colour, int(rows.sum()), float(weights[rows].sum() / weights.sum()))
+        for text, code, colour, rows in lines
+        if rows.any()
     ]
     if not candidates.safe.any():
         counts.append(ReasonCount(candidates.safe_text, "safe", reasons.SAFE, 0, 0.0))
@@ -62,7 +62,7 @@ def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
 
 
 def carried_mm(scan: Any | None) -> tuple[int, str]:
-    """How many digits of a mm a CT's voxels carry, and half the longest side of one as " ± 0.4"; 1 and "" without."""
+    """Digits of a mm that a CT's voxels carry, and half the longest side of one as " ± 0.4"; 1 and "" without."""
     if scan is None:
         return 1, ""
     half = float(np.linalg.norm(scan.grid.T_ct_index[:3, :3], axis=0).max()) / 2
@@ -71,8 +71,8 @@ def carried_mm(scan: Any | None) -> tuple[int, str]:
 
 def length_text(mm: float, scan: Any | None) -> str:
     """A length in the digits that the CT carries, as "93 ± 3 mm"."""
-    digits, told = carried_mm(scan)
-    return number(mm, digits, f"{told} mm".strip())
+    digits, tolerance = carried_mm(scan)
+    return number(mm, digits, f"{tolerance} mm".strip())
 
 
 def nearest_text(candidates: Candidates, row: int, scan: Any | None = None) -> str:

@@ -1,4 +1,4 @@
-"""Colours for what the pictures and the page show. Those of the verdicts stand beside the reasons."""
+"""Colours of pictures and page. Those of the verdicts stand beside the reasons."""
 
 import re
 
@@ -19,7 +19,7 @@ OUTSIDE: Rgb = (128, 128, 140)
 SKIN: Rgb = (226, 176, 148)
 TARGET_POINT: Rgb = (214, 0, 30)
 NEEDLE_COLOUR, REGION_COLOUR, BENT_COLOUR = (0, 229, 255), (255, 77, 240), (182, 255, 0)
-"""Of the slices: on grey none is near a structure's colour."""
+"""Colours of the slices: on grey none is near a structure's colour."""
 
 ORGAN_COLOURS: tuple[Rgb, ...] = (  # for structures without a colour of custom, in order; right and left are one
     (178, 168, 220), (208, 190, 150), (118, 92, 62), (226, 140, 160),
@@ -90,6 +90,6 @@ def organ_colours(names: tuple[str, ...]) -> dict[str, Rgb]:
 
 
 def safe_shades(fraction: Floats) -> NDArray[np.uint8]:
-    """Greens for a share 0..1 of the clearance range, shape (n,) to (n, 3)."""
+    """Greens for a fraction 0..1 of the clearance range, shape (n,) to (n, 3)."""
     fraction = np.clip(np.nan_to_num(fraction, nan=0.0), 0.0, 1.0)[..., None]
     return np.round(np.array(SAFE_LOW) * (1 - fraction) + np.array(SAFE_HIGH) * fraction).astype(np.uint8)

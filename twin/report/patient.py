@@ -32,17 +32,17 @@ LEAST_SHOWN = 5e-5  # a chance or share below it rounds to nothing
 SHOWN_MM = 0.005  # a source that costs less would be 0.00
 NO_CHANCES = "No chances: they need markers, the arm, and a direction that is safe for the organs and the arm."
 NOT_REQUESTED = "this run only searched; the plan command plans the arm's motion"
-"""Where no plan was made because nobody wanted one."""
+"""Text where no plan was requested."""
 
 TRE_TEXT = "expected TRE at the target (rms), from the markers alone"
 TIP_ERROR_TEXT = "expected tip error (rms), in the arm configuration of the plan"
-"""Of the registration, and of the whole insertion with the arm's declared errors."""
+"""Names of the errors of the registration, and of the whole insertion with the arm's declared errors."""
 
 MOST_NEAREST = 12  # structures whose least clearance in a rehearsal is listed
 
 
 def counts(candidates: Candidates) -> list[Block]:
-    """How many directions fell to which reason; also the map's legend, whose patches have the lines of the map."""
+    """Table of the directions by reason; also the map's legend, whose patches have the lines of the map."""
     patch = Markup('<span class="patch {}" style="background-color:{}"></span>{}')
     code, rows = Markup("<code>{}</code>"), []
     for line in numbers.reason_counts(candidates):
@@ -55,18 +55,18 @@ def counts(candidates: Candidates) -> list[Block]:
 
 def windows(candidates: Candidates, scan: Any | None) -> list[Block]:
     """The best candidate of each window, with the window's size, in digits that the voxels of the CT carry."""
-    found = candidates.windows.windows
-    if not found:
+    ranked = candidates.windows.windows
+    if not ranked:
         return ["No direction is safe, so there is nothing to rank."]
-    shown = f"the first {MOST_WINDOWS} of " if len(found) > MOST_WINDOWS else ""
-    text = f"{shown}{plural(len(found), 'window')} (connected sets of safe directions), each with its best direction."
+    shown = f"the first {MOST_WINDOWS} of " if len(ranked) > MOST_WINDOWS else ""
+    text = f"{shown}{plural(len(ranked), 'window')} (connected sets of safe directions), each with its best direction."
     if candidates.cone_source:
         source = CONE_TEXT[candidates.cone_source]
         text += f" Safe cone: angle by which the needle may be off and stay safe for the organs, {source}."
-    return [grid(_window_fields(candidates, *numbers.carried_mm(scan)), found[:MOST_WINDOWS]), text]
+    return [grid(_window_fields(candidates, *numbers.carried_mm(scan)), ranked[:MOST_WINDOWS]), text]
 
 
-def _window_fields(candidates: Candidates, digits: int, told: str) -> list[Field]:
+def _window_fields(candidates: Candidates, digits: int, tolerance: str) -> list[Field]:
     button = Markup('<button type="button" class="pick" data-row="{}">{}</button>')
 
     def best(values: Any) -> Any:
@@ -82,9 +82,9 @@ def _window_fields(candidates: Candidates, digits: int, told: str) -> list[Field
         Field("θ °", lambda window: f"{np.degrees(candidates.theta[window.best]):.4g}"),
         Field("β °", lambda window: f"{np.degrees(candidates.beta[window.best]):.4g}"),
         Field("cost", best(ranking.cost), 3),
-        Field(f"clearance{told}", lambda window: nearest(window)[1], digits, "mm"),
+        Field(f"clearance{tolerance}", lambda window: nearest(window)[1], digits, "mm"),
         Field("nearest structure", lambda window: nearest(window)[0].replace("_", " ") or None),
-        Field(f"path{told}", best(path.length), digits, "mm"),
+        Field(f"path{tolerance}", best(path.length), digits, "mm"),
         Field("skin angle", best(np.degrees(path.skin_angle)), 0, "°"),
         Field("reach margin", best(candidates.arm.margin), 2),
         Field("safe cone", best(np.degrees(candidates.safe_cone)), 1, "°"),
@@ -132,8 +132,8 @@ def rehearsal(
         for c in done.contacts
     ]
     fraction = np.max(done.max_joint_speed / done.speed_limits)
-    kept = {name: float(np.min(mm)) for name, mm in done.clearance_mm.items() if name in keep_away and len(mm)}
-    least = sorted(kept.items(), key=lambda item: item[1])
+    by_name = {name: float(np.min(mm)) for name, mm in done.clearance_mm.items() if name in keep_away and len(mm)}
+    least = sorted(by_name.items(), key=lambda item: item[1])
     name, mm = least[0] if least else ("nothing", math.nan)
     needle = f"keeps {number(mm, 2, 'mm')} or more from every structure to avoid; nearest: {name}"
     if mm < 0:
@@ -162,80 +162,80 @@ def rehearsal(
     return [warned, (facts(rows), nearest), *([more] if len(least) > MOST_NEAREST else [])]
 
 
-def rooms(found: Mapping[str, Any] | None) -> list[Block]:
-    """What happened in many rooms, beside what was predicted; nothing without rooms."""
-    if found is None:
+def trials(summary: Mapping[str, Any] | None) -> list[Block]:
+    """Results of many trials, beside what was predicted; nothing without trials."""
+    if summary is None:
         return []
-    if found["realised_rms_mm"] is None:
-        return [Warn((f"{plural(found['rooms'], 'trial')}: the needle reached the target in none",))]
+    if summary["realised_rms_mm"] is None:
+        return [Warn((f"{plural(summary['rooms'], 'trial')}: the needle reached the target in none",))]
     touched = (
-        (f"touched {name.replace('_', ' ')}", fraction, found["p_touch_by_structure"][name])
-        for name, fraction in found["touch_share_by_structure"].items()
+        (f"touched {name.replace('_', ' ')}", fraction, summary["p_touch_by_structure"][name])
+        for name, fraction in summary["touch_share_by_structure"].items()
     )
-    shares = (
-        ("inside the 95 % ellipsoid", found["coverage_95"], 0.95),
-        ("hit the target", found["hit_share"], found["mean_p_hit"]),
-        ("touched a structure to avoid", found["touch_share"], found["mean_p_touch"]),
+    fractions = (
+        ("inside the 95 % ellipsoid", summary["coverage_95"], 0.95),
+        ("hit the target", summary["hit_share"], summary["mean_p_hit"]),
+        ("touched a structure to avoid", summary["touch_share"], summary["mean_p_touch"]),
         *((text, fraction, chance) for text, fraction, chance in touched if max(fraction, chance) >= LEAST_SHOWN),
     )
-    rows = [("tip error, rms, mm", f"{found['realised_rms_mm']:.3f}", f"{found['predicted_rms_mm']:.3f}")]
-    rows += [(text, _share(fraction), _share(chance)) for text, fraction, chance in shares]
-    rows += _stepwise_rows(found) if "steps" in found else []
-    led = f", guidance {found['guidance']}" if "guidance" in found else ""
-    head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}{led}", "realised", "predicted")
-    return [Table(head, tuple(rows)), Warn(tuple(_reserves(found))), *_sources(found)]
+    rows = [("tip error, rms, mm", f"{summary['realised_rms_mm']:.3f}", f"{summary['predicted_rms_mm']:.3f}")]
+    rows += [(text, _percent(fraction), _percent(chance)) for text, fraction, chance in fractions]
+    rows += _stepwise_rows(summary) if "steps" in summary else []
+    led = f", guidance {summary['guidance']}" if "guidance" in summary else ""
+    head = (f"{plural(summary['rooms'], 'trial')}, seed {summary['seed']}{led}", "realised", "predicted")
+    return [Table(head, tuple(rows)), Warn(tuple(_reserves(summary))), *_sources(summary)]
 
 
-def _stepwise_rows(found: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """The same patients without control scans, and what these cost; predictions where there are some."""
-    alone, sizes = found["open_loop"], ", ".join(number(mm, 2) for mm in found["correction_mm"] if mm is not None)
+def _stepwise_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Rows of the same patients without control scans, and what these cost; predictions where there are some."""
+    alone, sizes = summary["open_loop"], ", ".join(number(mm, 2) for mm in summary["correction_mm"] if mm is not None)
     rms = "-" if alone["realised_rms_mm"] is None else f"{alone['realised_rms_mm']:.3f}"
-    hits = "-" if alone["hit_share"] is None else _share(alone["hit_share"])
+    hits = "-" if alone["hit_share"] is None else _percent(alone["hit_share"])
     return [
         ("open loop: tip error, rms, mm", rms, f"{alone['predicted_rms_mm']:.3f}"),
-        ("open loop: hit the target", hits, _share(alone["mean_p_hit"])),
-        (f"corrections of {plural(found['steps'], 'step')} (rms, mm: {sizes})", number(found["passes"], 2), "-"),
-        ("control scans, and their dose, mSv", f"{number(found['scans'], 2)}: {number(found['dose_msv'], 2)}", "-"),
-        ("minutes (open loop)", f"{number(found['minutes'], 1)} ({number(alone['minutes'], 1)})", "-"),
+        ("open loop: hit the target", hits, _percent(alone["mean_p_hit"])),
+        (f"corrections of {plural(summary['steps'], 'step')} (rms, mm: {sizes})", number(summary["passes"], 2), "-"),
+        ("control scans, and their dose, mSv", f"{number(summary['scans'], 2)}: {number(summary['dose_msv'], 2)}", "-"),
+        ("minutes (open loop)", f"{number(summary['minutes'], 1)} ({number(alone['minutes'], 1)})", "-"),
     ]
 
 
-def _share(fraction: float) -> str:
+def _percent(fraction: float) -> str:
     return f"{100 * fraction:.2f} %"
 
 
-def _reserves(found: Mapping[str, Any]) -> list[str]:
+def _reserves(summary: Mapping[str, Any]) -> list[str]:
     said = []
-    if found["wrong_belief"]:
+    if summary["wrong_belief"]:
         said.append("The trials were drawn from [rehearsal.errors]: the belief is wrong by design.")
-    if found["unreached"]:
-        said.append(f"In {found['unreached']:,} trials the arm did not reach the pose; they are not counted.")
-    if found.get("stopped"):
+    if summary["unreached"]:
+        said.append(f"In {summary['unreached']:,} trials the arm did not reach the pose; they are not counted.")
+    if summary.get("stopped"):
         left = "a correction would have left the corridor, and the needle was stopped"
-        counted = f"predicted: {_share(found['p_stop'])}; they do not hit, and are in no other number"
-        said.append(f"In {found['stopped']:,} trials {left} ({counted}).")
-    notes = (*found.get("assumed", ()), *found.get("lost_sight", ()))
+        counted = f"predicted: {_percent(summary['p_stop'])}; they do not hit, and are in no other number"
+        said.append(f"In {summary['stopped']:,} trials {left} ({counted}).")
+    notes = (*summary.get("assumed", ()), *summary.get("lost_sight", ()))
     said += [f"{one[0].upper()}{one[1:]}." for one in notes]
-    if found["guessed_touches"]:
+    if summary["guessed_touches"]:
         how = "a posture was assumed (touch.csv, q1_deg to q6_deg)"
         said.append(f"The arm's joints at the touches are not known: {how}.")
     return said
 
 
-def _sources(found: Mapping[str, Any]) -> list[Block]:
-    shares = sorted(found.get("predicted_share", {}).items(), key=lambda source: -source[1])
-    named = [f"{SOURCES[name].text} {100 * part:.0f} %" for name, part in shares if part >= LEAST_FRACTION]
+def _sources(summary: Mapping[str, Any]) -> list[Block]:
+    fractions = sorted(summary.get("predicted_share", {}).items(), key=lambda source: -source[1])
+    named = [f"{SOURCES[name].text} {100 * part:.0f} %" for name, part in fractions if part >= LEAST_FRACTION]
     said = [f"Sources of the predicted variance: {', '.join(named)}."] if named else []
-    if found.get("deflection_mm") is not None:
-        said.append(f"The needle bends by {found['deflection_mm']:.2f} mm, to a side drawn in each trial.")
-    if "pushed_mm" in found:
-        said.append(f"The needle pushes the target on by {found['pushed_mm']:.2f} mm.")
-    if found.get("physics") is not None:
+    if summary.get("deflection_mm") is not None:
+        said.append(f"The needle bends by {summary['deflection_mm']:.2f} mm, to a side drawn in each trial.")
+    if "pushed_mm" in summary:
+        said.append(f"The needle pushes the target on by {summary['pushed_mm']:.2f} mm.")
+    if summary.get("physics") is not None:
         said.append(
             "{rooms} of them in the simulator: tips at most {largest_apart_mm:.4f} mm from the kinematic result; "
-            "contacts in {rooms_with_contacts}.".format(**found["physics"])
+            "contacts in {rooms_with_contacts}.".format(**summary["physics"])
         )
-    return [*said, f"Not modelled: {found['not_modelled']}."]
+    return [*said, f"Not modelled: {summary['not_modelled']}."]
 
 
 def chances(breakdown: UncertaintyBreakdown | None, registration: Mapping[str, Any] | None) -> list[Block]:
@@ -303,9 +303,9 @@ def registration(report: Mapping[str, Any] | None) -> list[Block]:
         *([Field("TRE without it, mm", lambda item: without[item[0]]["rms_mm"], 3)] if without else []),
         *([Field("p without it", lambda item: f"{without[item[0]]['probability']:.2g}")] if without else []),
     ]
-    weak = Warn(tuple(f"weak: {flag}" for flag in flags)) if flags else "no flag raised"
+    flagged = Warn(tuple(f"weak: {flag}" for flag in flags)) if flags else "no flag raised"
     shown = (facts(rows), grid(markers, residuals.items())) if residuals else (facts(rows),)
-    return [shown, weak, *_advice(report)]
+    return [shown, flagged, *_advice(report)]
 
 
 def _advice(report: Mapping[str, Any]) -> list[Block]:
@@ -321,39 +321,39 @@ def _advice(report: Mapping[str, Any]) -> list[Block]:
         more = report["one_more"]
         place = f"{vector(more['point_mm'], 0, 'mm')} {more['space']}"
         said.append(f"one more marker helps most at {place}: {more['rms_mm']:.3f} mm")
-    if (found := report.get("correction")) is not None:
-        joints = ", ".join(f"{angle:.2f}" for angle in found["joints_deg"])
+    if (correction := report.get("correction")) is not None:
+        joints = ", ".join(f"{angle:.2f}" for angle in correction["joints_deg"])
         said.append((
             "aim corrected for the insertion at theta {theta_deg:.0f}, beta {beta_deg:.0f} (joints {joints} deg): "
             "moved by {moved_mm:.2f} mm and {turned_deg:.2f} deg; expected there {expected_mm:.2f} mm (rms), not "
             "corrected ({uncorrected_method}) {uncorrected_mm:.2f} mm; this relies on the arm errors in [errors]"
-        ).format(**{**found, "joints": joints}))  # fmt: skip
+        ).format(**{**correction, "joints": joints}))  # fmt: skip
     return said
 
 
-def budget(found: Mapping[str, Any] | None) -> list[Block]:
-    """What each source costs, what one change would leave, and the change that wins most."""
-    if found is None:
+def budget(summary: Mapping[str, Any] | None) -> list[Block]:
+    """Error budget: what each source costs, what one change would leave, and the change that wins most."""
+    if summary is None:
         return []
-    now, best = found["expected_mm"], found["best"]
+    now, best = summary["expected_mm"], summary["best"]
     said = [f"Expected tip error of this insertion, markers and arm together: {now:.2f} mm (rms)"]
-    if "limit_95_mm" in found:
+    if "limit_95_mm" in summary:
         said[0] += (
             ", inserted at theta {theta_deg:.0f}, beta {beta_deg:.0f}: {expected_lateral_mm:.2f} across it and "
             "{expected_depth_mm:.2f} along it; one of 20 insertions ends beyond {limit_95_mm:.2f} mm"
-        ).format(**found)
+        ).format(**summary)
     if now - best["expected_mm"] >= SHOWN_MM:
         said.append(f"The next {now - best['expected_mm']:.2f} mm would be gained by: {best['text']}")
     sources = grid(
         (Field("source", "text"), Field("alone", "alone_mm", 2, "mm"), Field("all but this", "without_mm", 2, "mm")),
-        (one for one in found["sources"] if one["alone_mm"] >= SHOWN_MM),
+        (one for one in summary["sources"] if one["alone_mm"] >= SHOWN_MM),
     )
-    changed = grid((Field("with this one change", "text"), Field("expected, mm", "expected_mm", 2)), found["changes"])
-    return [f"{'. '.join(said)}.", (sources, changed), f"Not modelled: {found['not_modelled']}."]
+    changed = grid((Field("with this one change", "text"), Field("expected, mm", "expected_mm", 2)), summary["changes"])
+    return [f"{'. '.join(said)}.", (sources, changed), f"Not modelled: {summary['not_modelled']}."]
 
 
 def certificate(summary: Mapping[str, Any]) -> list[Block]:
-    """What a certificate says of the cap; where nothing is safe, that this is proven, and to what."""
+    """A certificate's proof of the cap; where nothing is safe, that this is proven, and to what."""
     fraction = summary["undecided_share"]
     undecided = "" if fraction is None else f" ({100 * fraction:.2f} % of the cap)"
     area = f"{summary['undecided_square_deg']:.1f} square degrees{undecided}"

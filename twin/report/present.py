@@ -1,4 +1,4 @@
-"""The one presenter: what a job found, said once, for a terminal and for a page.
+"""The one presenter: results as blocks, stated once, for a terminal and for a page.
 
 A job lists its facts as fields: a name, where the value is found, digits and unit. Fields make a table of many rows, or
 the names and values of one; tables and sentences make sections; `text` and `html` show the same sections.
@@ -66,14 +66,14 @@ class Field(NamedTuple):
 
     def of(self, row: Any, *, unit: bool = False) -> str:
         """The value as it is shown, `Markup` as it is; with its unit, where that stands in no head."""
-        value = self._found(row)
+        value = self._cell(row)
         if value is None:
             return NOTHING
         if isinstance(value, str) or self.digits is None:
             return value if isinstance(value, str) else f"{value:,}" if isinstance(value, int) else f"{value:g}"
         return number(float(value), self.digits, self.unit if unit else "")
 
-    def _found(self, row: Any) -> Any:
+    def _cell(self, row: Any) -> Any:
         if not isinstance(self.value, str):
             return self.value(row)
         first, *within = self.value.split(".")
@@ -83,9 +83,9 @@ class Field(NamedTuple):
         return value
 
     def known(self, row: Any) -> bool:
-        """Whether a row has it."""
+        """Whether a row has a value of this field."""
         try:
-            return self._found(row) not in (None, "", ())
+            return self._cell(row) not in (None, "", ())
         except KeyError:
             return False
 
@@ -141,7 +141,7 @@ def facts(fields: Iterable[Field | tuple[str, ...]], row: Any = None) -> Table:
 
 
 def text(sections: Iterable[Section]) -> str:
-    """For a terminal."""
+    """Text of sections for a terminal."""
     return "\n".join(line for section in sections for line in _lines(section))
 
 
@@ -172,16 +172,16 @@ def _table_lines(table: Table) -> Iterator[str]:
     heads = [_plain(one) for one in table.head] or [""] * len(body[0])
     cells = [max(len(row[at]) for row in body) for at in range(len(heads))]
     widths = [max(w, *map(len, head.split()), min(len(head), FOLDED)) for w, head in zip(cells, heads, strict=True)]
-    folded = [wrap(head, max(wide, 1)) for head, wide in zip(heads, widths, strict=True)]
-    high = max(map(len, folded))
-    top = zip(*([*[""] * (high - len(one)), *one] for one in folded), strict=True)
+    folded = [wrap(head, max(width, 1)) for head, width in zip(heads, widths, strict=True)]
+    height = max(map(len, folded))
+    top = zip(*([*[""] * (height - len(one)), *one] for one in folded), strict=True)
     numeric = [
         all(not row[at] or row[at][0] in "-+<>" or row[at][0].isdigit() for row in body) for at in range(len(heads))
     ]
     to_right = [at > 0 and any(heads) and each for at, each in enumerate(numeric)]
     for row in (*top, *body):
         each = zip(row, widths, to_right, strict=True)
-        yield "  ".join(cell.rjust(wide) if right else cell.ljust(wide) for cell, wide, right in each)
+        yield "  ".join(cell.rjust(width) if right else cell.ljust(width) for cell, width, right in each)
 
 
 def _plain(cell: str) -> str:
@@ -189,7 +189,7 @@ def _plain(cell: str) -> str:
 
 
 def html(sections: Iterable[Section]) -> Markup:
-    """For a page; text is escaped, `Markup` is not."""
+    """HTML of sections for a page; text is escaped, `Markup` is not."""
     from puncture_twin.twin.report.page.template import filled
 
     kinds = ((Table, "table"), (Warn, "warn"), (tuple, "beside"), (Markup, "markup"), (str, "sentence"))
@@ -206,7 +206,7 @@ def blocks_html(blocks: Sequence[Block]) -> Markup:
 
 
 def bold(text: str) -> Markup:
-    """Of a page, in bold."""
+    """Text that a page shows in bold."""
     return Markup("<b>{}</b>").format(text)
 
 
@@ -243,8 +243,8 @@ def origin_section(seed: int | None) -> Markup:
             versions.append((name, version(name)))
         except PackageNotFoundError:
             versions.append((name, "not installed as a package"))
-    drawn = "none: no random numbers" if seed is None else str(seed)
-    return blocks_html([facts([("seed", drawn), *versions]), TIMES])
+    seeded = "none: no random numbers" if seed is None else str(seed)
+    return blocks_html([facts([("seed", seeded), *versions]), TIMES])
 
 
 def parts() -> list[str]:
@@ -259,7 +259,7 @@ def parts() -> list[str]:
 def footer(
     files: Iterable[str | Path], warnings: Iterable[str] = (), seconds: Mapping[str, float] | None = None
 ) -> list[Section]:
-    """How every command's text ends: what is in doubt, how long each stage took, and the files."""
+    """End of every command's text: warnings, how long each stage took, and the files."""
     said = [Section(f"warning: {one}", []) for one in warnings]
     if seconds is not None:
         said.append(Section("seconds: " + ", ".join(f"{stage} {spent:.1f}" for stage, spent in seconds.items()), []))

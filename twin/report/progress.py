@@ -38,7 +38,7 @@ class LineDisplay:
         return None
 
     def step(self, stage: str, what: str) -> None:
-        """Name what a stage is at; and what it was at, and for how long, where that was long."""
+        """Name the item of a stage; and the one before, and its time, where that was long."""
         took_s = time.monotonic() - self._since
         if self._at and took_s >= LONG_S:
             self.note(f"{self._at}, took {duration_text(took_s)}")
@@ -46,11 +46,11 @@ class LineDisplay:
         self._write(f"{stage}: {step_text(what)}")
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
-        """Say how far a stage is, its rate, and how long it still takes, as soon as there is time behind a rate."""
+        """Write how far a stage is, its rate and its remaining time, as soon as there is time behind a rate."""
         self._write(f"{stage}: {self._pace.text(stage, done, total, failed)}")
 
     def note(self, line: str) -> None:
-        """Write a line now: it is said once."""
+        """Write a line now: a note is shown once."""
         self._stream.write(line + "\n")
         self._stream.flush()
 
@@ -80,7 +80,7 @@ class BarDisplay:
         self._bars.stop()
 
     def step(self, stage: str, what: str) -> None:
-        """Name what a stage is at."""
+        """Name the item of a stage."""
         self._bars.update(self._task(stage, None), advance=1, description=f"{stage}: {step_text(what)}")
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
@@ -107,21 +107,21 @@ def rate_text(per_second: float) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """How long something takes, in the unit that a person would choose."""
+    """Text of a duration, in the unit that a person would choose."""
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
 class Pace:
-    """How fast a stage is, since its first count, or since it began anew."""
+    """Speed of a stage since its first count, or since it began anew."""
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[float, int, int]] = {}
         self._last: dict[str, int] = {}
 
     def text(self, stage: str, done: int, total: int, failed: int) -> str:
-        """How many are done of how many, how many of them failed; rate and time left, with time behind them."""
+        """Text of how many are done of how many, and how many failed; rate and time left, with time behind them."""
         began, first, of = self._since.get(stage, (0.0, 0, -1))
         if of != total or done < self._last[stage]:
             began, first = time.monotonic(), done

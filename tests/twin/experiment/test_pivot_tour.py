@@ -99,11 +99,11 @@ def test_the_twin_finds_the_tip_of_its_arm(context, tmp_path, monkeypatch):
 
     monkeypatch.setattr(true_needle, "draw_pivot_truth", without_noise)
     run = pivot_tour(context, tmp_path, 4, None, 0)
-    np.testing.assert_allclose(run.found.pivot.tip_flange, off + [0.0, 0.0, 401.0], atol=0.06)
-    assert run.found.pivot.residual_mm < 0.05
+    np.testing.assert_allclose(run.calibration.pivot.tip_flange, off + [0.0, 0.0, 401.0], atol=0.06)
+    assert run.calibration.pivot.residual_mm < 0.05
     assert "4 poses touched about" in pivot_tour_text(run)
     again = pivot_case(context.case, tmp_path / "pivot.csv")
-    np.testing.assert_allclose(again.pivot.tip_flange, run.found.pivot.tip_flange, atol=1e-6)
+    np.testing.assert_allclose(again.pivot.tip_flange, run.calibration.pivot.tip_flange, atol=1e-6)
     assert json.loads((tmp_path / "pivot.json").read_text())["tip_error_mm"] == pytest.approx(run.error_mm)
 
 

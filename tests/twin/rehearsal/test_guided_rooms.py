@@ -20,7 +20,7 @@ from puncture_twin.planning.uncertainty import guided
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import Bend
-from puncture_twin.twin.jobs.patient.run import room_count
+from puncture_twin.twin.jobs.patient.run import trial_count
 from puncture_twin.twin.plant import trial_devices
 from puncture_twin.twin.plant.trial_devices import TrialCameras
 from puncture_twin.twin.plant.true_needle import true_needle
@@ -368,10 +368,10 @@ def test_assumed_balls_fit_a_short_needle(made):
 
 def test_a_way_needs_trials():
     with refused("unknown_guidance"):
-        room_count(10, 0, "by hand")
+        trial_count(10, 0, "by hand")
     for rooms, physics in ((None, 0), (10, 2)):
         with refused("conflicting_options"):
-            room_count(rooms, physics, "ct")
+            trial_count(rooms, physics, "ct")
 
 
 class Nothing(Sight):
@@ -476,7 +476,7 @@ def test_steps_are_of_ct_alone(scanned):
         ("ct+scans", None, "unknown_guidance"),
     ):
         with refused(code):
-            room_count(10, 0, way, steps)
+            trial_count(10, 0, way, steps)
         with refused(code):
             rehearse_trials(*scanned(), 1, 3, way, steps=steps)
-    assert room_count(10, 0, "ct", 10).steps == 10
+    assert trial_count(10, 0, "ct", 10).steps == 10

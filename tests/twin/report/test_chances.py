@@ -14,7 +14,7 @@ from puncture_twin.twin.report.map.map_raster import chance_raster, map_raster, 
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Uncertainty, methods_text
 from puncture_twin.twin.report.page.page_data import map_data
-from puncture_twin.twin.report.patient import rooms
+from puncture_twin.twin.report.patient import trials
 from puncture_twin.twin.report.present import Section, text
 
 BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
@@ -104,6 +104,6 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
     assert "p_touch_any" in known and "p_touch_any" not in unknown
 
 
-def test_rooms_without_any_that_was_reached_say_nothing():
-    said = text([Section("many trials", rooms({**ROOMS, "realised_rms_mm": None}))])
-    assert "the needle reached the target in none" in said and "realised" not in said and rooms(None) == []
+def test_trials_without_any_that_was_reached_say_nothing():
+    said = text([Section("many trials", trials({**ROOMS, "realised_rms_mm": None}))])
+    assert "the needle reached the target in none" in said and "realised" not in said and trials(None) == []

@@ -1,1 +1,1 @@
-"""The commands ``batch``: a cohort planned, run, looked at, merged and compared; its texts and its page."""
+"""The commands ``batch``: a cohort planned, run, counted, merged and compared; its texts and its page."""

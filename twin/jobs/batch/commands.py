@@ -94,6 +94,6 @@ def _compare(
     from puncture_twin.planning.batch.merge import compare, read_cases
     from puncture_twin.twin.jobs.batch.jobs import change_summary, compare_text
 
-    found = compare(read_cases(before), read_cases(after))
-    summary = {"counts": dict(found.counts), "cases": [change_summary(one) for one in found.changes]}
-    finish("batch compare", found, summary, compare_text(found), as_json)
+    comparison = compare(read_cases(before), read_cases(after))
+    summary = {"counts": dict(comparison.counts), "cases": [change_summary(one) for one in comparison.changes]}
+    finish("batch compare", comparison, summary, compare_text(comparison), as_json)

@@ -62,21 +62,21 @@ class PlanRun:
 
     def summary(self, jobs: int) -> dict[str, Any]:
         """Plain values for JSON."""
-        found: dict[str, Any] = {
+        document: dict[str, Any] = {
             "cases": len(self.cases),
             "refused": [{"case": one.case, "reason": one.refusal} for one in self.refused],
             "known": self.known,
             "files": [] if self.guess else [str(self.out / plan.PLAN_NAME)],
         }
         if (guess := self.guess) is not None:
-            found["estimate"] = {
+            document["estimate"] = {
                 "sample": guess.sample,
                 "seconds_per_case": round(guess.seconds, 3),
                 "seconds": round(guess.seconds * (guess.cases - guess.refused) / jobs, 1),
                 "memory_mb": round(guess.memory_bytes * jobs / 1e6),
                 "disk_mb": round(guess.disk_bytes / 1e6, 1),
             }
-        return found
+        return document
 
 
 def plan_cohort(cohort: Path, out: Path, *, arm: bool | None, dry: bool, watcher: Watcher) -> PlanRun:
@@ -134,7 +134,7 @@ def run_summary(out: Path, counts: run.RunCounts) -> dict[str, Any]:
 
 @dataclass(frozen=True, repr=False)
 class Merged(Shown):
-    """A merged cohort, its files, and the cases that are not as they were expected, None where nothing was."""
+    """A merged cohort, its files, and the cases that differ from expected ones, None where none were given."""
 
     rows: Sequence[dict[str, Any]]
     files: tuple[Path, ...]
@@ -194,7 +194,7 @@ def merge_cohort(out: Path, expect: Path | None, tolerance_mm: float, watcher: W
 
 
 def plan_text(done: PlanRun, jobs: int) -> str:
-    """How many cases, how many of them are refused or known, and the estimate of a dry run."""
+    """Text of a plan: how many cases, how many are refused or known, and the estimate of a dry run."""
     refused = _listed(f"{one.case}: {one.refusal}" for one in done.refused)
     head = Section(f"{_cases(len(done.cases))}, {done.known} already with a row", refused)
     if done.guess is None:
@@ -214,7 +214,7 @@ def plan_text(done: PlanRun, jobs: int) -> str:
 
 
 def run_text(out: Path, counts: run.RunCounts) -> str:
-    """What a run did, and what comes next."""
+    """Text of a run's counts, and the next command."""
     refused = f" ({counts.refused_before} refused)" if counts.refused_before else ""
     same = f"{counts.same} the same as other cases, " if counts.same else ""
     done = f"{counts.ended[0] + counts.ended[1]} done, {counts.failed} failed"
@@ -227,7 +227,7 @@ def run_text(out: Path, counts: run.RunCounts) -> str:
 
 
 def state_text(state: run.CohortState) -> str:
-    """Done, failed with reasons, missing, stale."""
+    """Text of a cohort's cases: done, failed with reasons, missing, stale."""
     done = f"{state.done:6d}  done ({state.safe} with a safe direction, {state.no_safe} without)"
     failed, missing = f"{state.failed:6d}  failed", f"{state.missing:6d}  missing"
     stale = [f"{state.stale:6d}  stale: {STALE}", *_listed(state.stale_cases)]
@@ -235,34 +235,34 @@ def state_text(state: run.CohortState) -> str:
 
 
 def merge_text(merged: Merged) -> str:
-    """How many of which kind, the files, and what is not as expected."""
-    found = merged.summary()
+    """Text of a merged cohort: cases of each kind, the files, and what is not as expected."""
+    summary = merged.summary()
     kinds = (
         "{safe} with a safe direction, {no_safe} without, {failed} failed ({refused} of them refused), "
         "{not_run} not run"
-    ).format(**found, failed=found["refused"] + found["program_failed"])
+    ).format(**summary, failed=summary["refused"] + summary["program_failed"])
     changed = merged.changed
     unlike = [] if changed is None else [Section(f"{len(changed)} not as expected", _listed(map(change_line, changed)))]
     wrote = (Section(f"wrote {path}", []) for path in merged.files)
-    return text([Section(f"{_cases(found['cases'])}: {kinds}", []), *wrote, Section(NOW, []), *unlike])
+    return text([Section(f"{_cases(summary['cases'])}: {kinds}", []), *wrote, Section(NOW, []), *unlike])
 
 
-def compare_text(found: merge.Comparison) -> str:
-    """Per case what changed, and in sum."""
-    counts, moved = found.counts, found.moved_mm
+def compare_text(comparison: merge.Comparison) -> str:
+    """Text of a comparison: the change of each case, and all in sum."""
+    counts, moved_mm = comparison.counts, comparison.moved_mm
     kinds = ", ".join(f"{counts[kind]} {kind}" for kind in sorted(counts))
     far = []
-    if moved:
-        far = [f"cases that are safe in both: {len(moved)}; their best entries moved by {np.median(moved):.2f} mm "
-               f"(median), {max(moved):.2f} mm at most"]  # fmt: skip
-    changed = [one for one in found.changes if one.kind != "same" or one.moved_mm]
-    return text([Section(f"{_cases(len(found.changes))}: {kinds}", [*far, *_listed(map(change_line, changed))])])
+    if moved_mm:
+        far = [f"cases that are safe in both: {len(moved_mm)}; their best entries moved by {np.median(moved_mm):.2f} "
+               f"mm (median), {max(moved_mm):.2f} mm at most"]  # fmt: skip
+    changed = [one for one in comparison.changes if one.kind != "same" or one.moved_mm]
+    return text([Section(f"{_cases(len(comparison.changes))}: {kinds}", [*far, *_listed(map(change_line, changed))])])
 
 
 def change_line(change: merge.CaseChange) -> str:
-    """One case in two cohorts."""
+    """Line of one case in two cohorts."""
 
-    def told(row: Any) -> str:
+    def outcome(row: Any) -> str:
         if row is None:
             return "-"
         return f"{row['safe']} safe" if row["reason"] is None else str(row["reason"])
@@ -270,7 +270,7 @@ def change_line(change: merge.CaseChange) -> str:
     moved = "" if change.moved_mm is None else f"; best entry moved {change.moved_mm:.2f} mm"
     more = "" if change.clearance_mm is None else f", clearance {change.clearance_mm:+.3f} mm"
     options = "" if change.options == "{}" else f" {change.options}"
-    return f"{change.case}{options}: {change.kind}: {told(change.before)} -> {told(change.after)}{moved}{more}"
+    return f"{change.case}{options}: {change.kind}: {outcome(change.before)} -> {outcome(change.after)}{moved}{more}"
 
 
 def _cases(count: int) -> str:
@@ -334,7 +334,7 @@ def write_cohort_page(name: str, rows: Sequence[Row], inputs: Sequence[Input], p
     ]
 
     def verdict(row: Row) -> str:
-        """Never "safe" alone where the arm was not checked; why a case has none stands under the failures."""
+        """Verdict of a case: never "safe" alone where the arm was not checked; failures say why a case has none."""
         if row["exit_code"] == 0:
             return "safe" if row["arm"] == ARM_CHECKED else "safe for the organs"
         return OUTCOMES.get(row["exit_code"], merge.NOT_RUN)

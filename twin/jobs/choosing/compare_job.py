@@ -55,7 +55,7 @@ def parse_two(
 
 
 def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool) -> tuple[Path, Path] | None:
-    """The two plans that are to be compared; None where it is two choices of a case."""
+    """The two plans to compare; None where two choices of a case are compared."""
     allowed = "PLAN_A PLAN_B [--case CASE], or CASE with one choice or two"
     if not is_plan(source):
         if other is not None or case is not None:
@@ -69,7 +69,7 @@ def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool)
 def compare_source(
     source: Path, other: Path | None, case: Path | None, stated: Stated, arm: bool | None, watcher: Watcher
 ) -> Comparison:
-    """Two plans, or two choices of a case; the arm must reach them, or with None where the case has its base."""
+    """Compared plans, or choices of a case; the arm must reach them, or with None where the case has its base."""
     plans = two_plans(source, other, case, any(stated))
     if plans is None:
         choices = parse_two(*stated)
@@ -78,21 +78,21 @@ def compare_source(
 
 
 def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Comparison:
-    """Two directions of a case, each checked, beside what the search says of them."""
-    found, space = context.search(), context.case.space
-    a, b = ((choice.text(space), explain_choice(context, choice, found)) for choice in choices)
-    return compare_paths(context, found, a, b)
+    """Comparison of two directions of a case, each checked, with their place in its search."""
+    candidates, space = context.search(), context.case.space
+    a, b = ((choice.text(space), explain_choice(context, choice, candidates)) for choice in choices)
+    return compare_paths(context, candidates, a, b)
 
 
-def compare_paths(context: CaseContext, found: Candidates, *paths: tuple[str, Explanation | Plan]) -> Comparison:
-    """Two directions or plans of a case, each with its title, beside what its search says; a plan is checked again."""
-    a, b = (_checked_side(context, found, title, path) for title, path in paths)
+def compare_paths(context: CaseContext, candidates: Candidates, *paths: tuple[str, Explanation | Plan]) -> Comparison:
+    """Comparison of two directions or plans of a case, each with its title, in its search; plans are checked again."""
+    a, b = (_checked_side(context, candidates, title, path) for title, path in paths)
     read = [one for side in (a, b) if side.explained is not None for one in side.explained.read]
     return Comparison(context.case.name, (*read, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
 
 
 def compare_plans(paths: tuple[Path, Path], context: CaseContext | None, note: Callable[[str], None]) -> Comparison:
-    """Two plans; with their case each is checked again."""
+    """Comparison of two plans; with their case each is checked again."""
     read = [read_noted_plan(path, note) for path in paths]
     inputs = tuple(source for source, _ in read)
     plans = [plan for _, plan in read]
@@ -110,7 +110,7 @@ def compare_plans(paths: tuple[Path, Path], context: CaseContext | None, note: C
 
 
 def _checked_side(context: CaseContext, candidates: Candidates, title: str, path: Explanation | Plan) -> Side:
-    """A plan must hold; its chances are those of the configuration in which it ends."""
+    """One side of a comparison; a plan is checked, and its chances are of the configuration in which it ends."""
     if isinstance(path, Plan):
         check_plan(path, context, Path(title))
         explained = context.explain(path.theta, path.beta)
@@ -123,18 +123,18 @@ def _checked_side(context: CaseContext, candidates: Candidates, title: str, path
 
 
 def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> dict[str, Any]:
-    """What a search says of a path, plain values; of one beside its grid there is neither rank nor cone."""
-    found: dict[str, Any] = dict.fromkeys(GRID_KEYS)
+    """A path's place in a search, plain values; one off the grid has neither rank nor cone."""
+    document: dict[str, Any] = dict.fromkeys(GRID_KEYS)
     row = nearest_row(candidates, outward_ct)
     if row is None or not (safe and candidates.safe[row]):
-        return found
+        return document
     windows = candidates.windows
     window = windows.windows[int(windows.of_row[row]) - 1]
-    found |= {"window": window.number, "window_square_deg": window.square_deg, "window_entry_cm2": window.entry_cm2}
+    document |= {"window": window.number, "window_square_deg": window.square_deg, "window_entry_cm2": window.entry_cm2}
     if np.linalg.norm(candidates.outward_ct[row] - outward_ct) > SAME_DIRECTION:
-        return found
+        return document
     cone_deg = finite(np.degrees(float(candidates.safe_cone[row])))
-    return found | {"rank": int(candidates.ranking.rank[row]), "safe_cone_deg": cone_deg}
+    return document | {"rank": int(candidates.ranking.rank[row]), "safe_cone_deg": cone_deg}
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ class Side:
 
     @property
     def safe(self) -> bool:
-        """Whether it is not rejected; a plan that was not checked again is what it was when it was made."""
+        """Whether the path is not rejected; a plan that was not checked again is what it was when it was made."""
         return self.explained is None or self.explained.safe
 
     def summary(self) -> dict[str, Any]:
@@ -177,7 +177,7 @@ class Comparison(Shown):
 
     @property
     def safe(self) -> bool:
-        """Whether neither is rejected."""
+        """Whether neither path is rejected."""
         return self.a.safe and self.b.safe
 
     @property
@@ -188,7 +188,7 @@ class Comparison(Shown):
 
     @property
     def entries_apart_mm(self) -> float:
-        """Between the skin entries, straight; NaN without one."""
+        """Straight distance between the skin entries, mm; NaN without one."""
         return float(np.linalg.norm(self.a.entry_ct - self.b.entry_ct))
 
     def summary(self) -> dict[str, Any]:

@@ -110,7 +110,7 @@ class CheckedList:
 
     @property
     def safe(self) -> bool:
-        """Whether every row is."""
+        """Whether every row is safe."""
         return all(row["verdict"] == "safe" for row in self.rows)
 
     def summary(self) -> dict[str, Any]:
@@ -125,15 +125,15 @@ class CheckedList:
         }
 
     def text(self) -> str:
-        """A line a row, then what kept those that are not safe."""
-        kept = []
+        """A line a row, then why those that are not safe are rejected."""
+        unfit = []
         for row in self.rows:
             where = f" ({row['reason_structure']})" if row["reason_structure"] else ""
             why = f"{row['reason']}{where}" if row["reason"] else row["verdict"]
             detail = f": {row['detail']}" if row["detail"] else ""
-            kept += [f"row {row['row']}: {why}{detail}"] if row["verdict"] != "safe" else []
+            unfit += [f"row {row['row']}: {why}{detail}"] if row["verdict"] != "safe" else []
         head = Section(
-            f"case {self.case_name}: {plural(len(self.rows), 'row')}, arm {self.arm}", [grid(FIELDS, self.rows), *kept]
+            f"case {self.case_name}: {plural(len(self.rows), 'row')}, arm {self.arm}", [grid(FIELDS, self.rows), *unfit]
         )
         return text([head, *footer(self.files, self.warnings)])
 
@@ -144,19 +144,19 @@ def _outcome(context: CaseContext, row: Listed, *, of_target: bool) -> Outcome:
         explained = explain_choice(context, row.choice, None)
         return Outcome(explained, explained.verdict)
     there = context.at(to_lps(np.array([row.point_mm]), context.case.space)[0])
-    found = there.search()
-    counts = int(found.safe.sum()), len(found.windows)
+    candidates = there.search()
+    counts = int(candidates.safe.sum()), len(candidates.windows)
     try:
-        explained = explain_choice(there, row.choice, found)
+        explained = explain_choice(there, row.choice, candidates)
     except NoAnswerError as error:
         return Outcome(None, "rejected", str(error), *counts)
     return Outcome(explained, explained.verdict, "", *counts)
 
 
-def _document(row: Listed, found: Outcome) -> dict[str, Any]:
+def _document(row: Listed, outcome: Outcome) -> dict[str, Any]:
     document: dict[str, Any] = {name: "" if TYPES.get(name) == "string" else None for name in COLUMNS}
     document |= {} if row.point_mm is None else dict(zip(("x_mm", "y_mm", "z_mm"), row.point_mm, strict=True))
-    if (explained := found.explained) is not None:
+    if (explained := outcome.explained) is not None:
         one, place, breakdown = explained.candidates, explained.facts.place, explained.breakdown
         entry = to_lps(one.path.entry_ct, explained.case.space)[0]
         document |= {
@@ -174,8 +174,8 @@ def _document(row: Listed, found: Outcome) -> dict[str, Any]:
             "p_hit": None if breakdown is None else breakdown.p_hit,
             "p_touch_any": None if breakdown is None else breakdown.p_touch_any,
         }
-    document |= {"row": row.number, "name": row.name, "verdict": found.verdict, "windows": found.windows}
-    return document | {"safe_directions": found.safe_directions, "detail": found.detail or document["detail"]}
+    document |= {"row": row.number, "name": row.name, "verdict": outcome.verdict, "windows": outcome.windows}
+    return document | {"safe_directions": outcome.safe_directions, "detail": outcome.detail or document["detail"]}
 
 
 def _written(checked: CheckedList, context: CaseContext, out: Path) -> CheckedList:

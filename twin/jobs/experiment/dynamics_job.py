@@ -1,4 +1,4 @@
-"""`calibrate dynamics`: an arm's dynamics from recorded torques, and what their error moves the tip by.
+"""`calibrate dynamics`: an arm's dynamics from recorded torques, and the tip error that their error causes.
 
 The controller of `twin.world.control` feeds the identified dynamics forward; what they err by, tau = Y_b db with db of
 the covariance C, its spring takes, with the masses L of the tip halfway along the insertion:
@@ -62,18 +62,18 @@ class Dynamics(Shown):
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        found, worst = self.identified, self.tip_cov[np.trace(self.tip_cov, axis1=1, axis2=2).argmax()]
+        fit, worst = self.identified, self.tip_cov[np.trace(self.tip_cov, axis1=1, axis2=2).argmax()]
         path_mm, end_mm = (float(np.sqrt(np.trace(one))) for one in (worst, self.tip_cov[-1]))
         costs = None if self.budget is None else {"the identified dynamics": end_mm, **self.budget}
-        friction = found.friction.transpose(1, 0, 2).tolist()
+        friction = fit.friction.transpose(1, 0, 2).tolist()
         return {
-            "rows": found.rows,
-            "base_parameters": len(found.values),
-            "condition": found.condition,
-            "unexplained": found.unexplained,
-            "columns": found.base.columns.tolist(),
-            "values": found.values.tolist(),
-            "covariance": found.covariance.tolist(),
+            "rows": fit.rows,
+            "base_parameters": len(fit.values),
+            "condition": fit.condition,
+            "unexplained": fit.unexplained,
+            "columns": fit.base.columns.tolist(),
+            "values": fit.values.tolist(),
+            "covariance": fit.covariance.tolist(),
             "joints": [
                 {
                     "joint": joint + 1,
@@ -81,7 +81,7 @@ class Dynamics(Shown):
                     "coulomb_sd_nm": coulomb_sd,
                     "viscous_nm_s": viscous,
                     "viscous_sd_nm_s": viscous_sd,
-                    "torque_sd_nm": float(found.torque_sd_nm[joint]),
+                    "torque_sd_nm": float(fit.torque_sd_nm[joint]),
                 }
                 for joint, ((viscous, viscous_sd), (coulomb, coulomb_sd)) in enumerate(friction)
             ],
@@ -90,7 +90,7 @@ class Dynamics(Shown):
             "tip_end_mm": end_mm,
             "budget": None if costs is None else [{"text": name, "alone_mm": mm} for name, mm in costs.items()],
             "expected_mm": None if costs is None else float(np.linalg.norm(list(costs.values()))),
-            "findings": [one.document() for one in found.findings()],
+            "findings": [one.document() for one in fit.findings()],
         }
 
     def _facts(self) -> Facts:
@@ -100,15 +100,15 @@ class Dynamics(Shown):
 
     def text(self) -> str:
         """For a person."""
-        found = self.summary()
-        budget: list[Block] = [] if found["budget"] is None else [
-            f"Expected tip error with the identified dynamics: {found['expected_mm']:.4f} mm (rms)",
-            grid((Field("source", "text"), Field("alone", "alone_mm", 4, "mm")), found["budget"]),
+        report = self.summary()
+        budget: list[Block] = [] if report["budget"] is None else [
+            f"Expected tip error with the identified dynamics: {report['expected_mm']:.4f} mm (rms)",
+            grid((Field("source", "text"), Field("alone", "alone_mm", 4, "mm")), report["budget"]),
         ]  # fmt: skip
         return text([
-            Section(f"dynamics, {found['rows']:,} rows", [facts(FACTS, found), grid(JOINTS, found["joints"])]),
+            Section(f"dynamics, {report['rows']:,} rows", [facts(FACTS, report), grid(JOINTS, report["joints"])]),
             Section("error budget", budget),
-            Section("", [Warn(tuple(one["sentence"] for one in found["findings"]))]),
+            Section("", [Warn(tuple(one["sentence"] for one in report["findings"]))]),
         ])  # fmt: skip
 
 
@@ -130,12 +130,12 @@ JOINTS = (
 
 
 def calibrate_dynamics(context: CaseContext, recording: Path) -> Dynamics:
-    """Identify the dynamics of a case's arm, and say what their error costs at the tip.
+    """The identified dynamics of a case's arm, with what their error costs at the tip.
 
     Raises InputError: The arm's base is not stated, no insertion is reached, or the recording cannot be used.
     """
     case, T_base_ct = context.case, context.require_arm().T_base_ct
-    found = identify(case.robot.model, read_torques(recording), gravity(case, T_base_ct), where=recording)
+    fit = identify(case.robot.model, read_torques(recording), gravity(case, T_base_ct), where=recording)
     placed = context.placement
     registration = None if placed is None else placed.registration
     anatomy = partial(load_anatomy, case, cache=user_cache())
@@ -144,7 +144,7 @@ def calibrate_dynamics(context: CaseContext, recording: Path) -> Dynamics:
     if q_end is None:
         refuse("the arm reaches no insertion", case.path, "a target within the arm's reach", "out_of_reach")
     budget = None if chain is None else {SOURCES[one.source].text: one.alone_mm for one in source_costs(chain)}
-    return Dynamics(found, tip_covariances(case, found, insertion_to(case, q_end), gravity(case, T_base_ct)), budget)
+    return Dynamics(fit, tip_covariances(case, fit, insertion_to(case, q_end), gravity(case, T_base_ct)), budget)
 
 
 def gravity(case: Case, T_base_ct: Floats) -> Floats:
@@ -153,7 +153,7 @@ def gravity(case: Case, T_base_ct: Floats) -> Floats:
 
 
 def insertion_to(case: Case, q_end: Floats) -> Trajectory:
-    """The needle moved in along itself to q_end (6,), rad: over its shaft, or as much of it as the arm can."""
+    """Insertion of the needle along itself to q_end (6,), rad: over its shaft, or as much of it as the arm can."""
     model, T_end = case.robot.model, flange_pose(case.robot.model, q_end)
     back = np.arange(0.0, case.needle.shaft_mm + 1.0)
     T = np.tile(T_end, (len(back), 1, 1))
@@ -169,10 +169,10 @@ def insertion_to(case: Case, q_end: Floats) -> Trajectory:
     )
 
 
-def _loop(model: UrModel, found: Identified, q: Floats, J: Floats, down_base: Floats) -> tuple[Floats, Floats]:
+def _loop(model: UrModel, fit: Identified, q: Floats, J: Floats, down_base: Floats) -> tuple[Floats, Floats]:
     """A (18, 18) and B (18, 6) of a sample's step of e, e' and int e, under a wrench, about the joints q (6,), rad."""
     motion = JointMotion(np.tile(q, (7, 1)), np.zeros((7, 6)), np.eye(7, 6))
-    torque = regressor(model, motion, down_base)[:, :, found.base.columns] @ found.values
+    torque = regressor(model, motion, down_base)[:, :, fit.base.columns] @ fit.values
     M = np.asarray((torque[:6] - torque[6]).T)  # kg m^2, drives included: of unit accelerations less those of none
     stiffness, inverse_mass = Stiffness(), J @ np.linalg.solve(M, J.T)
     K, D = np.diag(stiffness.diagonal), damping(stiffness, J, M)
@@ -183,7 +183,7 @@ def _loop(model: UrModel, found: Identified, q: Floats, J: Floats, down_base: Fl
     return stepped[0], stepped[1]
 
 
-def tip_covariances(case: Case, found: Identified, insertion: Trajectory, down_base: Floats) -> Floats:
+def tip_covariances(case: Case, fit: Identified, insertion: Trajectory, down_base: Floats) -> Floats:
     """Covariance of the tip about its path, shape (m, 3, 3), mm^2, base frame, by the equation above.
 
     A sample's step takes the wrench of its middle: friction begins and ends with the motion, at once.
@@ -191,17 +191,17 @@ def tip_covariances(case: Case, found: Identified, insertion: Trajectory, down_b
     model, tip_m = case.robot.model, float(to_m(case.needle.length_mm))
     reference = reference_of(model, tip_m, insertion, SAMPLE_S / 2, HOLD_S)
     motion = JointMotion(reference.q, reference.speed, reference.acceleration)
-    Y = regressor(model, motion, down_base)[:, :, found.base.columns]
+    Y = regressor(model, motion, down_base)[:, :, fit.base.columns]
     J = tips(model, tip_m, reference.q).J
     wrench = np.linalg.solve(J.transpose(0, 2, 1), Y)
     half = len(J) // 2
-    A, B = _loop(model, found, reference.q[half], J[half], down_base)
+    A, B = _loop(model, fit, reference.q[half], J[half], down_base)
     pushes = wrench[1::2] - wrench[0]
-    state, G = np.zeros((18, len(found.values))), np.empty((len(pushes), 3, len(found.values)))
+    state, G = np.zeros((18, len(fit.values))), np.empty((len(pushes), 3, len(fit.values)))
     for row, push in enumerate(pushes):
         G[row] = to_mm(state[:3])
         state = A @ state + B @ push
-    return np.asarray(G @ found.covariance @ G.transpose(0, 2, 1))
+    return np.asarray(G @ fit.covariance @ G.transpose(0, 2, 1))
 
 
 def recorded_or_given(context: CaseContext, recording: Path | None, record: Path | None, seed: int) -> Path:

@@ -90,7 +90,7 @@ def pivot_case(case: Case, joints: Path) -> PivotRun:
 
 
 def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> Pivot:
-    """The tip from joints (n, 6), rad, that touched one place."""
+    """The pivot calibration of the tip from joints (n, 6), rad, that touched one place."""
     if case.errors is None:
         refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
     model, tip_mm = case.robot.model, case.needle.length_mm
@@ -114,12 +114,12 @@ def _pivot_said(run: PivotRun) -> list[Section]:
         f"the case states {stated:g} mm along z: {z - stated:+.3f} mm, and {np.hypot(x, y):.3f} mm off that axis",
         f"residual {pivot.residual_mm:.3f} mm rms; expected from the declared touch noise: {pivot.expected_mm:.3f}, "
         f"with the declared errors of the arm {pivot.expected_whole_mm:.3f}",
-        *_doubt(run),
+        *_likely_cause(run),
     ]
     return [Section(one, []) for one in said]
 
 
-def _doubt(run: PivotRun) -> list[str]:
+def _likely_cause(run: PivotRun) -> list[str]:
     pivot = run.pivot
     if not pivot.large:
         arm = pivot.expected_whole_mm > LARGE * pivot.expected_mm
@@ -137,7 +137,7 @@ def _doubt(run: PivotRun) -> list[str]:
 class PivotTourRun:
     """An executed pivot calibration: the tip that its joints give, and the true one (3,); the place planned; mm."""
 
-    found: PivotRun
+    calibration: PivotRun
     seed: int
     place_base: Floats  # shape (3,), mm: the place as it was planned
     true_tip_flange: Floats  # shape (3,), mm
@@ -146,18 +146,18 @@ class PivotTourRun:
 
     @property
     def error_mm(self) -> float:
-        """Found tip against the true one."""
-        return float(np.linalg.norm(self.found.pivot.tip_flange - self.true_tip_flange))
+        """Distance of the calibrated tip from the true one."""
+        return float(np.linalg.norm(self.calibration.pivot.tip_flange - self.true_tip_flange))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON; the expected error is the rms by the declared errors."""
         return {
-            **self.found.summary(),
+            **self.calibration.summary(),
             "seed": self.seed,
             "place_mm": self.place_base.tolist(),
             "true_tip_flange_mm": self.true_tip_flange.tolist(),
             "tip_error_mm": self.error_mm,
-            "expected_tip_error_mm": float(np.sqrt(np.trace(self.found.pivot.cov_tip))),
+            "expected_tip_error_mm": float(np.sqrt(np.trace(self.calibration.pivot.cov_tip))),
             "failed": dict(self.touched.failed),
             "seconds": self.touched.seconds,
             "files": [str(path) for path in self.files],
@@ -199,10 +199,10 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
             what = f"{len(touched.readings)} of {len(tour.touches)} poses were touched; {LEAST_POSES} are needed: {why}"
             raise NoAnswerError(what, code="too_few_poses")
         names, joints = tuple(one.name for one in touched.readings), np.array([one.q for one in touched.readings])
-        found = PivotRun(case, calibrated(case, names, joints, where=str(case.path)), names, case.inputs)
+        calibration = PivotRun(case, calibrated(case, names, joints, where=str(case.path)), names, case.inputs)
         true_tip = truth.eta[PARAMETERS["tip_offset"]] + np.array([0.0, 0.0, tour.tip_mm])
         files = draft.final((draft.folder / PIVOT, draft.folder / SUMMARY))
-        run = PivotTourRun(found, seed, place, true_tip, touched, files)
+        run = PivotTourRun(calibration, seed, place, true_tip, touched, files)
         points = np.array([one.point_base for one in touched.readings])
         write_points(draft.folder / PIVOT, NamedPoints(names, points, None, joints=joints))
         write_result(run.summary(), draft.folder / SUMMARY, out)
@@ -211,10 +211,10 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
 
 def pivot_tour_text(run: PivotTourRun) -> str:
     """For the terminal."""
-    expected = float(np.sqrt(np.trace(run.found.pivot.cov_tip)))
+    expected = float(np.sqrt(np.trace(run.calibration.pivot.cov_tip)))
     at, count, seconds = vector(run.place_base, 0, "mm"), len(run.touched.readings), run.touched.seconds
     failed = [f"{name} not touched: {why}" for name, why in run.touched.failed.items()]
     off = f"error {run.error_mm:.3f} mm, expected {expected:.3f} mm (rms)"
     true = f"the true tip (seed {run.seed}) is {vector(run.true_tip_flange, 3, 'mm')}: {off}"
     head = Section(f"{count} poses touched about {at} (base) in {seconds:.0f} s", failed)
-    return text([head, *_pivot_said(run.found), Section(true, []), *footer(run.files)])
+    return text([head, *_pivot_said(run.calibration), Section(true, []), *footer(run.files)])

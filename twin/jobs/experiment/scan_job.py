@@ -41,7 +41,7 @@ SUB_VOXEL_SD = 0.03  # of a drawn marker along the bed, over the spacing: the li
 
 
 class ScanRequest(NamedTuple):
-    """What the user asks for; ``beside`` places what lies outside of the patient, nothing where None."""
+    """A requested scan; ``beside`` places what lies outside of the patient, nothing where None."""
 
     settings: ScanSettings
     marker: scenes.MarkerKind = "disc"
@@ -50,7 +50,7 @@ class ScanRequest(NamedTuple):
 
 
 def parse_marker(text: str) -> scenes.MarkerKind:
-    """What stands at the markers' places; refused where nothing is known by that name."""
+    """The kind of marker by its name. Raises InputError: an unknown one."""
     for kind in get_args(scenes.MarkerKind):
         if text == kind:
             return kind
@@ -60,7 +60,7 @@ def parse_marker(text: str) -> scenes.MarkerKind:
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """A needle in a control CT: where it truly is, where it was found, or None and why not; its target."""
+    """A needle in a control CT: its true place, the one that was read, or None and why not; its target."""
 
     true: scenes.TrueRod
     found: FoundNeedle | None
@@ -85,7 +85,7 @@ class ScanRun:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm, HU, degrees; true places beside readings."""
         grid, settings = self.image.grid, self.request.settings
-        true, found = self.lesion
+        true, read = self.lesion
         return {
             "case": self.context.case.name,
             "settings": {
@@ -102,7 +102,7 @@ class ScanRun:
                 "middle_along_bed": SUB_VOXEL_SD * settings.spacing_mm,
             },
             "markers": list(self._markers()),
-            "lesion": {"true_mm": true.tolist(), "found_mm": found.tolist(), "error_mm": (found - true).tolist()},
+            "lesion": {"true_mm": true.tolist(), "found_mm": read.tolist(), "error_mm": (read - true).tolist()},
             "needle": None if self.control is None else control_summary(self.control),
             "thin_voxels": dict(self.image.thin),
             "inputs": inputs_document(self.inputs),
@@ -120,7 +120,7 @@ class ScanRun:
 
 
 def control_summary(control: Control) -> dict[str, Any]:
-    """A needle as found and as it is, mm and degrees; errors from the target, as clinical papers state them."""
+    """A needle as read and as it truly is, mm and degrees; errors from the target, as clinical papers state them."""
     true, needle = needle_error(control.true.tip_ct, control.true.forward_ct, control.target), control.found
     if needle is None:
         return {"found": None, "true": true._asdict(), "why_not": control.why_not}
@@ -244,28 +244,28 @@ def _write_labels(folder: Path, file: str, names: Sequence[str], run: ScanRun, l
 
 
 def scan_text(run: ScanRun) -> str:
-    """Errors in mm along x, y, z of the scan (left, back, head)."""
-    found, folder = run.summary(), run.files[-1].parent
-    settings, shape = found["settings"], " x ".join(map(str, found["voxels"]))
-    target = ",".join(f"{one:.2f}" for one in found["target_mm"])
+    """Text of a scan's errors, mm, along x, y, z of the scan (left, back, head)."""
+    document, folder = run.summary(), run.files[-1].parent
+    settings, shape = document["settings"], " x ".join(map(str, document["voxels"]))
+    target = ",".join(f"{one:.2f}" for one in document["target_mm"])
     pixel, spacing = settings["pixel_mm"], settings["spacing_mm"]
-    thin = ", ".join(f"{name} ({count})" for name, count in found["thin_voxels"].items())
+    thin = ", ".join(f"{name} ({count})" for name, count in document["thin_voxels"].items())
     rows = [
         ("scan", f"{shape} voxels of {pixel:g} x {pixel:g} x {spacing:g} mm, noise {settings['noise_hu']:g} HU, seed "
                  f"{settings['seed']}"),
-        *([] if found["markers"] else [("markers", "none")]),
-        ("lesion", f"{_vector(found['lesion']['error_mm'])}   read minus true"),
-        *_needle_rows(found["needle"]),
+        *([] if document["markers"] else [("markers", "none")]),
+        ("lesion", f"{_vector(document['lesion']['error_mm'])}   read minus true"),
+        *_needle_rows(document["needle"]),
         *([("thin", f"parts thinner than a voxel fill whole voxels of the label map: {thin}")] if thin else []),
     ]  # fmt: skip
     return text([
-        Section(str(folder), [facts(rows), *_marker_blocks(found)]),
+        Section(str(folder), [facts(rows), *_marker_blocks(document)]),
         Section(f"next: run-twin init {folder} --ct {SERIES} --target={target}", []),
     ])  # fmt: skip
 
 
-def _marker_blocks(found: dict[str, Any]) -> list[Block]:
-    markers, theory = found["markers"], found["theory_mm"]
+def _marker_blocks(document: dict[str, Any]) -> list[Block]:
+    markers, theory = document["markers"], document["theory_mm"]
     if not markers:
         return []
     keys = ("rule_error_mm", "error_mm")

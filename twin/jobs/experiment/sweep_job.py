@@ -1,4 +1,4 @@
-"""`rehearse --sweep`: the needle turned about the target from outside, as far as the planner allows it."""
+"""`rehearse --sweep`: the needle rotated about the target from outside, as far as the planner allows it."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +25,7 @@ Angles = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class SweepRun:
-    """What was planned and what was measured."""
+    """A planned sweep and its measurements."""
 
     case_name: str
     inputs: tuple[Input, ...]
@@ -36,7 +36,7 @@ class SweepRun:
 
     @property
     def whole(self) -> bool:
-        """Whether it reached its end without a contact."""
+        """Whether the sweep reached its end without a contact."""
         return not (self.plan.stopped or self.swept.contacts)
 
     def summary(self) -> dict[str, Any]:
@@ -80,7 +80,7 @@ def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | Non
 
 
 def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angles | None:
-    """Where a sweep shall end, of "THETA,BETA" in degrees; refused without a sweep, or of more than one case."""
+    """The end of a sweep from "THETA,BETA" in degrees; refused without a sweep, or of more than one case."""
     if not sweep:
         refuse("--to needs --sweep", "--to", "--sweep --to THETA,BETA", "conflicting_options")
     if is_plan(source) or not alone:
@@ -97,23 +97,23 @@ def parse_angles(text: str) -> Angles:
 
 
 def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angles, Angles]:
-    """Where it starts and ends; the grid is searched only where it has to be."""
+    """Start and end of a sweep; the grid is searched only where it has to be."""
     if to is not None and not choice.of_grid:
         return chosen_angles(context.case, choice), to
     with context.stages.time("search"):
-        found = context.search()
-    chosen = choose(context, found, choice)
+        candidates = context.search()
+    chosen = choose(context, candidates, choice)
     row = int(chosen.rows[0])
     start = float(chosen.candidates.theta[row]), float(chosen.candidates.beta[row])
     if to is not None:
         return start, to
-    windows = found.windows
-    near = int(np.argmax(found.outward_ct @ chosen.candidates.outward_ct[row]))
+    windows = candidates.windows
+    near = int(np.argmax(candidates.outward_ct @ chosen.candidates.outward_ct[row]))
     if not windows.of_row[near]:
         refuse("the direction is in no window of the grid", "--sweep", "--to THETA,BETA", "no_window")
     rows = windows.rows(int(windows.of_row[near]))
-    far = int(rows[np.argmin(found.outward_ct[rows] @ found.outward_ct[near])])
-    return start, (float(found.theta[far]), float(found.beta[far]))
+    far = int(rows[np.argmin(candidates.outward_ct[rows] @ candidates.outward_ct[near])])
+    return start, (float(candidates.theta[far]), float(candidates.beta[far]))
 
 
 def sweep_text(run: SweepRun) -> str:

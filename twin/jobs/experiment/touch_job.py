@@ -1,4 +1,4 @@
-"""Markers touched in the twin: planned, executed where everything truly is, written as `registration` reads them.
+"""Markers touched in the twin: planned, executed by the ground truth, written as `registration` reads them.
 
 A reading lies some hundredths of a millimetre from the joints that put the true tip on the true marker: a physical run
 and its drawn twin err alike.
@@ -46,7 +46,7 @@ DRAWS = 400  # where one axis errs most their rms is known to 3.5 %
 
 
 class Use(NamedTuple):
-    """What readings are good for: the tip's expected error (rms) at the target, and that of the erring arm in truth."""
+    """Quality of readings: the tip's expected error (rms) at the target, and that of the erring arm in truth."""
 
     registration: Registration
     expected_mm: float
@@ -55,7 +55,7 @@ class Use(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TouchRun(Shown):
-    """What was planned, what was read, and what it is good for; in words why not, where it does not register."""
+    """Planned touches, their readings, and the quality of these, or in words why they do not register."""
 
     case_name: str
     inputs: tuple[Input, ...]
@@ -150,7 +150,7 @@ def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
 
 
 def touch_once(context: CaseContext, tour: Tour, seed: int) -> tuple[ExecutedTouches, Use | str]:
-    """Execute a tour where everything truly is, by one draw of the errors; and what its readings are good for."""
+    """Execute a tour by the ground truth of one draw of the errors; the touches, and the quality of their readings."""
     truth = true_touches(context, tour, seed)
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):
@@ -159,7 +159,7 @@ def touch_once(context: CaseContext, tour: Tour, seed: int) -> tuple[ExecutedTou
 
 
 def drawn_once(context: CaseContext, tour: Tour, seed: int) -> Use | str:
-    """What the same tour in the same truth is good for where every touch reads its joints exactly: no physics."""
+    """Quality of a tour in the same truth without physics, where every touch reads its joints exactly."""
     plan, truth = tour.plan, true_touches(context, tour, seed)
     joints = np.array([truth.q_contact(plan.model, plan.tip_mm, touch) for touch in plan.touches])
     points = np.array([nominal_tip(plan.model, plan.tip_mm, q) for q in joints])
@@ -168,7 +168,7 @@ def drawn_once(context: CaseContext, tour: Tour, seed: int) -> Use | str:
 
 
 def _use(context: CaseContext, tour: Tour, truth: TouchTruth, read: NamedPoints) -> Use | str:
-    """What readings are good for; in words why they do not suffice."""
+    """Quality of readings, or in words why they do not suffice."""
     if len(read.names) < MIN_MARKERS:
         return f"{len(read.names)} of {len(tour.plan.touches)} markers were touched; {MIN_MARKERS} are needed"
     assert context.placement is not None
@@ -199,7 +199,7 @@ def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
 
 
 def true_touches(context: CaseContext, tour: Tour, seed: int) -> TouchTruth:
-    """Where everything truly is: the belief is one registration that the declared errors allow."""
+    """Ground truth of the touches: the belief is one registration that the declared errors allow."""
     errors = _true_errors(context)
     assert context.placement is not None and context.placement.registration is not None
     E = misregistered(context, tour.outward_ct, tour.q_insertion, seed)
@@ -216,7 +216,7 @@ def _points(touched: Touched) -> NamedPoints:
 
 
 def true_at_target(context: CaseContext, seed: int) -> AtTarget:
-    """What is true when the needle arrives, by one draw of the declared errors."""
+    """Ground truth when the needle arrives, by one draw of the declared errors."""
     return draw_at_target(context.case.target_ct, _true_errors(context), seed)
 
 
@@ -258,7 +258,7 @@ def touch_text(run: TouchRun) -> str:
 
 
 def _per_touch(touched: Touched) -> float | None:
-    """Seconds for each that was read."""
+    """Seconds for each marker that was read."""
     return touched.seconds / len(touched.readings) if touched.readings else None
 
 
@@ -277,14 +277,14 @@ def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
             refused[seed] = str(error)
         context.watcher.count("runs", seed + 1, runs)
     uses = {seed: drawn_once(context, tour, seed) for seed in range(max(DRAWS, runs))}
-    drawn = {seed: float("nan") if isinstance(use, str) else use.tip_error_mm for seed, use in uses.items()}
-    alike = [drawn[one["seed"]] for one in ended if np.isfinite(drawn[one["seed"]])]
+    errors_mm = {seed: float("nan") if isinstance(use, str) else use.tip_error_mm for seed, use in uses.items()}
+    alike = [errors_mm[one["seed"]] for one in ended if np.isfinite(errors_mm[one["seed"]])]
     return {
         "expected_mm": tour.plan.expected_mm,
         "realised_mm": or_null(rms([one["tip_error_mm"] for one in ended])),
         "seconds_per_touch": float(np.mean([one["seconds_per_touch"] for one in ended])) if ended else None,
         "drawn": {
-            "realised_mm": rms([drawn[seed] for seed in range(DRAWS) if np.isfinite(drawn[seed])]),
+            "realised_mm": rms([errors_mm[seed] for seed in range(DRAWS) if np.isfinite(errors_mm[seed])]),
             "draws": DRAWS,
             "realised_in_the_same_truths_mm": or_null(rms(alike)),
         },
@@ -294,7 +294,7 @@ def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
 
 
 def physical_run(context: CaseContext, tour: Tour, seed: int) -> dict[str, Any]:
-    """One run."""
+    """Run the experiment once, with the truth of a seed."""
     touched, use = touch_once(context, tour, seed)
     if touched.failed or isinstance(use, str):
         why = "; ".join(f"marker {name}: {reason}" for name, reason in touched.failed.items())

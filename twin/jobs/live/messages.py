@@ -38,7 +38,7 @@ READY, TIMED_OUT = 1, 7  # codes of a STATUS
 
 
 class Stamp(NamedTuple):
-    """By what a sender knows its message: an answer bears the same. Version of the header, time, number."""
+    """Identity of a message, which its answer repeats: version of the header, time, number."""
 
     version: int
     seconds: int
@@ -52,7 +52,7 @@ class Stamp(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What is known of a message before its body has come."""
+    """Header of a message, before its body has come."""
 
     kind: str
     name: str
@@ -156,7 +156,7 @@ def packed(kind: str, name: str, stamp: Stamp, content: bytes) -> bytes:
 
 
 def text_content(text: str) -> bytes:
-    """Of a STRING; one too long is refused."""
+    """Content of a STRING; one too long is refused."""
     data = text.encode()
     if len(data) > MOST_TEXT:
         refuse(f"an answer of {len(data)} bytes", "STRING", f"at most {MOST_TEXT} bytes", "too_large")
@@ -164,14 +164,14 @@ def text_content(text: str) -> bytes:
 
 
 def point_content(point: Sequence[float] | Floats | None, name: str) -> bytes:
-    """Of a POINT with this one point; None has no point, which takes an earlier one from a screen."""
+    """Content of a POINT with this one point; None has no point, which takes an earlier one from a screen."""
     if point is None:
         return b""
     return POINT.pack(name.encode()[:63], b"", *(255, 255, 0, 255), *point, 0.0, b"")
 
 
 def image_content(values: NDArray[np.uint16], first: tuple[float, float], step: float) -> bytes:
-    """Of an IMAGE of one slice; `first` are coordinates along a row and along a column."""
+    """Content of an IMAGE of one slice; `first` are coordinates along a row and along a column."""
     rows, columns = values.shape
     middle = first[0] + step * (columns - 1) / 2.0, first[1] + step * (rows - 1) / 2.0
     axes = (step, 0.0, 0.0, 0.0, step, 0.0, 0.0, 0.0, 1.0, *middle, 0.0)
@@ -180,7 +180,7 @@ def image_content(values: NDArray[np.uint16], first: tuple[float, float], step: 
 
 
 def mesh_content(points: Floats, cells: bytes, scalars: Mapping[str, NDArray[Any]]) -> bytes:
-    """Of a POLYDATA of points (p, 3), quads as of `quad_bytes`, and scalars (p,) by name."""
+    """Content of a POLYDATA of points (p, 3), quads as of `quad_bytes`, and scalars (p,) by name."""
     count = len(cells) // (5 * 4)
     names = b"".join(name.encode() + b"\0" for name in scalars)
     head = MESH.pack(len(points), 0, 0, 0, 0, count, len(cells), 0, 0, len(scalars))
@@ -195,7 +195,7 @@ def quad_bytes(quads: Ints) -> bytes:
 
 
 def status_content(code: int, text: str) -> bytes:
-    """Of a STATUS."""
+    """Content of a STATUS."""
     return STATUS.pack(code, 0, b"") + text.encode() + b"\0"
 
 

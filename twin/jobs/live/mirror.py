@@ -60,7 +60,7 @@ class Receiver(Protocol):
         """Seconds since the controller started; 0 before its first word."""
 
     def isConnected(self) -> bool:  # noqa: N802  # the library's name
-        """Whether the line stands."""
+        """Whether the connection is up."""
 
 
 class RecordedState(NamedTuple):
@@ -92,7 +92,7 @@ def connect(host: str, command: str = "mirror") -> Receiver:
 
 
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
-    """What a receiver reads, every so often; nothing twice. Time and angles may be one package (8 ms) apart.
+    """States that a receiver reads, at intervals, none twice. Time and angles may be one package (8 ms) apart.
 
     It ends after so many seconds of the robot's clock, or never of None. Raises InputError: The robot hangs up or falls
     silent, or tells something that is no joint angles.
@@ -132,7 +132,7 @@ class LedArm:
         next(rest for rest in self._rests() if np.abs(rest - q).max() <= NEAR_RAD)
 
     def _rests(self) -> Iterator[Floats]:
-        """One rest after the other; a long one again and again."""
+        """Rests of the arm, one after the other; a long one again and again."""
         since: list[RecordedState] = []
         for state in live_states(self.receiver, period_s=self.period_s, seconds=LED_S):
             if since and np.abs(state.q - since[0].q).max() > STILL_RAD:
@@ -146,7 +146,7 @@ class LedArm:
 
 
 class Mirrored(NamedTuple):
-    """What the twin shows for one joint state; CT frame, mm."""
+    """Needle and arm of one joint state; CT frame, mm."""
 
     time_s: float
     q: Floats
@@ -169,7 +169,7 @@ class Mirrored(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Mirror:
-    """Turns joint angles into what the case's patient would see of the needle. The arm is its nominal model."""
+    """Computes the needle in the case's patient from joint angles. The arm is its nominal model."""
 
     model: UrModel
     T_base_ct: Floats
@@ -185,7 +185,7 @@ class Mirror:
         return cls(case.robot.model, checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
 
     def show(self, state: RecordedState) -> Mirrored:
-        """One joint state."""
+        """The mirrored needle and arm of one joint state."""
         T = np.linalg.inv(self.T_base_ct) @ flange_pose(self.model, state.q)
         forward = T[:3, 2]
         tip = T[:3, 3] + self.needle_length_mm * forward
@@ -228,7 +228,7 @@ def readings_of(
 
 
 def mirror_text(shown: Mirrored) -> str:
-    """One state of a mirrored arm."""
+    """Text of one state of a mirrored arm."""
     x, y, z = shown.tip_ct
     joints = " ".join(f"{angle:7.2f}" for angle in np.degrees(shown.q))
     return (
@@ -276,7 +276,7 @@ class LedTouches:
 
 
 def refuse_of_twin(choice: Choice, seed: int) -> None:
-    """Refuse what is of the twin alone beside ``--host``."""
+    """Refuse options of the twin alone beside ``--host``."""
     if choice != Choice() or seed:
         refuse("a direction, or a seed, beside --host", "touch", "--host HOST alone: no tour is planned",
                "conflicting_options")  # fmt: skip

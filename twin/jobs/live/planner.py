@@ -1,4 +1,4 @@
-"""What `live` answers: the safe map of a target, and the verdict of a needle's direction, as `check` gives it.
+"""Answers of `live`: the safe map of a target, and the verdict of a needle's direction, as `check` gives it.
 
     Target  a point       -> SafeMap (POLYDATA), SafeGrid (IMAGE), SafeMapInfo (STRING)
     Needle  a pose        -> Verdict (STRING), Entry (POINT)
@@ -41,7 +41,7 @@ from puncture_twin.twin.jobs.live import messages
 AIMED_MM = 2.0  # a hand and a tracker together keep a needle on a line to about this
 NOT_AIMED = "not aimed"  # the path is safe, and the needle is not on it
 LEFT_OUT = ("case", "inputs", "entry_ct_mm", "warnings", "findings")
-"""Of a direction's summary: Status has them, or they are in the case's space."""
+"""Keys of a direction's summary that are left out: Status has them, or they are in the case's space."""
 FREE, NO_STRUCTURE = 0, 65_535  # values of SafeGrid where nothing blocks, and where no structure can be named
 ELSEWHERE_MM = 1e-6  # within this of the case's target another is as good
 WARM = 64  # directions that are checked before the first client comes: kernels are compiled then
@@ -63,7 +63,7 @@ class MapMesh:
 
     @classmethod
     def of(cls, case: Case) -> MapMesh:
-        """Of a case's grid."""
+        """The mesh of a case's grid."""
         directions, half = case.directions(), case.search.step / 2.0
         assert directions.grid is not None  # every case's grid is regular
         theta = np.clip(directions.theta[:, None] + half * np.array([-1, -1, 1, 1]), 0.0, np.pi)
@@ -73,14 +73,14 @@ class MapMesh:
         return cls(directions.grid, to_lps(units, Space.RAS), messages.quad_bytes(quads), case.needle.length_mm)
 
     def content(self, target_ras: list[float], scalars: Mapping[str, NDArray[Any]]) -> bytes:
-        """Of a POLYDATA about a target, with values (n,) by name."""
+        """Content of a POLYDATA about a target, with values (n,) by name."""
         points = np.array(target_ras) + self.radius_mm * self.corners
         return messages.mesh_content(
             points, self.cells, {name: np.repeat(values, 4) for name, values in scalars.items()}
         )
 
     def image(self, values: Ints) -> bytes:
-        """Of an IMAGE: a value (n,) a direction; beta along its rows, theta along its columns, in degrees."""
+        """Content of an IMAGE: a value (n,) a direction; beta along its rows, theta along its columns, in degrees."""
         shape = len(self.grid.theta), len(self.grid.beta)
         first = float(np.degrees(self.grid.beta[0])), float(np.degrees(self.grid.theta[0]))
         return messages.image_content(values.astype(np.uint16).reshape(shape), first, float(np.degrees(self.grid.step)))
@@ -88,7 +88,7 @@ class MapMesh:
 
 @dataclass(eq=False)
 class Session:
-    """What a client has said: its target, unless it was refused, and its needle."""
+    """State of a client: its target, unless it was refused, and its needle."""
 
     context: CaseContext | None
     needle: Question | None = None
@@ -106,7 +106,7 @@ class Question(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """A message that goes out, and its type and name: of those only the newest waits."""
+    """An outgoing message, its type and its name: of each only the newest waits."""
 
     name: str
     data: bytes
@@ -116,7 +116,7 @@ class Planner:
     """Answers the questions of many clients about one case, each with a target of its own."""
 
     def __init__(self, context: CaseContext) -> None:
-        """Prepare for questions: everything that is made once is made here."""
+        """Prepare everything that is computed once, before questions come."""
         if context.case.space is Space.LOCAL:
             refuse('space "local": OpenIGTLink knows RAS', context.case.path, "a case of a patient", "local_space")
         self._mesh = MapMesh.of(context.case)
@@ -131,16 +131,16 @@ class Planner:
         explained(at, float(checked.theta[best]), float(checked.beta[best])).summary()
 
     def begin(self) -> None:
-        """Make what the thread that answers has of its own, before it is asked."""
+        """Prepare what belongs to the answering thread, before the first question."""
         if self._context.reach is not None:
             _ = self._context.reach.checker
 
     def session(self) -> Session:
-        """Of a client that has said nothing yet: the case's target."""
+        """Session of a new client: the case's target."""
         return Session(self._context)
 
     def subject(self, header: messages.Header) -> str | None:
-        """What a message is about; see the head of this module."""
+        """Subject of a message; see the head of this module."""
         kind, name = header.kind, header.name
         if kind == "GET_STATUS" or (kind, name) == ("STRING", "Query"):
             return "status"
@@ -149,7 +149,7 @@ class Planner:
         return "needle" if kind == "TDATA" or (kind, name) == ("TRANSFORM", "Needle") else None
 
     def needle(self, session: Session) -> Question | None:
-        """What a client has last asked of its needle, which a new target answers anew; None where it was refused."""
+        """Question of a client's last needle, which a new target answers anew; None where it was refused."""
         return None if session.context is None else session.needle
 
     def answers(self, question: Question) -> Iterator[Answer]:
@@ -177,7 +177,7 @@ class Planner:
             yield from self._verdict(session, tip_ras, axis_ras, message.stamp)
 
     def refused(self, subject: str | None, stamp: messages.Stamp, error: PlanningError) -> Iterator[Answer]:
-        """What stands in place of answers: no cells, no free direction, no entry, and why."""
+        """Answers to a refused question: no cells, no free direction, no entry, and why."""
         document = {"error": {"code": error.code, "sentence": str(error)}}
         if subject == "target":
             yield _answer("POLYDATA", "SafeMap", stamp, messages.mesh_content(np.zeros((0, 3)), b"", {}))
@@ -205,38 +205,38 @@ class Planner:
         }
         return _text("Status", stamp, document)
 
-    def _map(self, found: SafeMap, stamp: messages.Stamp) -> Iterator[Answer]:
-        mesh, target_ras = self._mesh, _ras(found.target_ct)
-        scalars: dict[str, NDArray[Any]] = {"blocked": found.blocked.astype(np.int64), "structure": found.structure}
+    def _map(self, tested: SafeMap, stamp: messages.Stamp) -> Iterator[Answer]:
+        mesh, target_ras = self._mesh, _ras(tested.target_ct)
+        scalars: dict[str, NDArray[Any]] = {"blocked": tested.blocked.astype(np.int64), "structure": tested.structure}
         yield _answer("POLYDATA", "SafeMap", stamp, mesh.content(target_ras, scalars))
-        values = np.where(found.blocked, np.where(found.structure < 0, NO_STRUCTURE, found.structure + 1), FREE)
+        values = np.where(tested.blocked, np.where(tested.structure < 0, NO_STRUCTURE, tested.structure + 1), FREE)
         yield _answer("IMAGE", "SafeGrid", stamp, mesh.image(values))
         document = {
             "target_ras_mm": target_ras,
             "radius_mm": mesh.radius_mm,
-            "directions": len(found.blocked),
-            "blocked": int(found.blocked.sum()),
+            "directions": len(tested.blocked),
+            "blocked": int(tested.blocked.sum()),
             "not_tested": NOT_TESTED,
-            "structures": list(found.structures),
+            "structures": list(tested.structures),
         }
         yield _text("SafeMapInfo", stamp, document)
 
     def _verdict(self, session: Session, tip_ras: Floats, axis_ras: Floats, stamp: messages.Stamp) -> Iterator[Answer]:
-        """What `check` says of the needle's direction, and whether its line is the one that was checked."""
+        """Verdict of `check` on the needle's direction, and whether its line is the one that was checked."""
         if session.context is None:
             refuse("the last target was refused", "Needle", "a Target first", "no_target")
         case = session.context.case
         tip, axis = to_lps(np.array([tip_ras, axis_ras]), Space.RAS)
         theta, beta = angles(-axis @ case.T_ct_entry[:3, :3])
-        found = explained(session.context, float(theta), float(beta))
+        explanation = explained(session.context, float(theta), float(beta))
         ahead = float((case.target_ct - tip) @ axis)
         off = float(np.linalg.norm(case.target_ct - tip - ahead * axis))
-        entry, q = found.candidates.path.entry_ct[0], found.candidates.arm.q_insertion[0]
+        entry, q = explanation.candidates.path.entry_ct[0], explanation.candidates.arm.q_insertion[0]
         farthest = float(np.hypot(off, max(-ahead, 0.0)))  # a point of the needle from the path, up to its hub
-        aimed = farthest <= AIMED_MM and farthest <= slack_mm(found.candidates)
-        verdict, text = found.verdict, " ".join(line.strip() for line in found.head())
-        if found.safe:
-            verdict = found.candidates.safe_text if aimed else NOT_AIMED
+        aimed = farthest <= AIMED_MM and farthest <= slack_mm(explanation.candidates)
+        verdict, text = explanation.verdict, " ".join(line.strip() for line in explanation.head())
+        if explanation.safe:
+            verdict = explanation.candidates.safe_text if aimed else NOT_AIMED
         if verdict == NOT_AIMED:
             where = f"the line passes the target at {off:.1f} mm, {ahead:.1f} mm ahead"
             text = f"{verdict}: {where}; parallel to it, {text}"
@@ -247,10 +247,10 @@ class Planner:
             "target_ras_mm": _ras(case.target_ct),
             "off_line_mm": off,
             "ahead_mm": ahead,
-            "slack_mm": finite(slack_mm(found.candidates)),
+            "slack_mm": finite(slack_mm(explanation.candidates)),
             "entry_ras_mm": point,
             "joints_deg": np.degrees(q).tolist() if np.isfinite(q).all() else None,
-            "check": {key: value for key, value in found.summary().items() if key not in LEFT_OUT},
+            "check": {key: value for key, value in explanation.summary().items() if key not in LEFT_OUT},
         }
         yield _text("Verdict", stamp, document)
         yield _answer("POINT", "Entry", stamp, messages.point_content(point, verdict))
@@ -262,16 +262,16 @@ def explained(context: CaseContext, theta: float, beta: float) -> Explanation:
 
 
 def slack_mm(candidates: Candidates) -> float:
-    """By how much the first path keeps more than each margin, at least: beside what the needle may bend.
+    """Least clearance of the first path beyond each margin, mm, less what the needle may bend.
 
     Over the breath, the least clearance is held against the largest margin, since it is known of no structure. inf
     where nothing demands a margin, NaN where it is not known.
     """
     clearance, breathing = candidates.clearance, candidates.breathing
-    found = np.nanmin(np.append(clearance.by_structure[0] - clearance.margins, np.inf))
+    slack = np.nanmin(np.append(clearance.by_structure[0] - clearance.margins, np.inf))
     if breathing is not None:
-        found = np.minimum(found, breathing.clearance[0] - np.nanmax(np.append(clearance.margins, 0.0)))
-    return float(found if candidates.deflection is None else found - candidates.deflection[0])
+        slack = np.minimum(slack, breathing.clearance[0] - np.nanmax(np.append(clearance.margins, 0.0)))
+    return float(slack if candidates.deflection is None else slack - candidates.deflection[0])
 
 
 def _ras(point_ct: Floats) -> list[float]:

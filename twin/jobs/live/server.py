@@ -35,7 +35,7 @@ USED = "the messages of docs/reference/live.md"
 
 
 class Exchange:
-    """What waits between clients and planner: the newest question of each subject, in turn for each client.
+    """Queue between clients and planner: the newest question of each subject, in turn for each client.
 
     A needle without a newer pose for `pose_s` is asked about by the exchange itself, as one that is refused.
     """
@@ -65,7 +65,7 @@ class Exchange:
             return self._answers.pop(client, None) is not None
 
     def close(self) -> None:
-        """There are no more questions, and no clients."""
+        """End all waits: there are no more questions, and no clients."""
         with self._lock:
             self._closed = True
             self._answers.clear()
@@ -97,7 +97,7 @@ class Exchange:
             return None
 
     def _silent(self, posed: Question) -> Question:
-        """What takes the place of a pose that counts no longer, whether it was answered or not."""
+        """Question in place of a pose that counts no longer, whether it was answered or not."""
         del self._posed[posed.client]
         if "needle" in self._questions.get(posed.client, {}):
             self._taken(posed.client, "needle")
@@ -106,7 +106,7 @@ class Exchange:
         return posed._replace(message=None, fault=silent)
 
     def take_of(self, client: int, subject: str) -> Question | None:
-        """What a client asks about a subject, out of turn; None where it does not."""
+        """Question of a client about a subject, out of turn; None without one."""
         with self._lock:
             return self._taken(client, subject) if subject in self._questions.get(client, {}) else None
 
@@ -140,7 +140,7 @@ class Log:
         self._times: list[float] = []
 
     def line(self, where: str, text: str) -> None:
-        """Log it, if not too many were."""
+        """Log a line, if not too many were."""
         with self._lock:
             now = time.monotonic()
             self._times = [one for one in self._times if now - one < LINES_S]
@@ -150,7 +150,7 @@ class Log:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """A socket that listens; a port that is taken is told before a case is read. Clients wait until `serve`."""
+    """A socket that listens; a port that is taken is refused before a case is read. Clients wait until `serve`."""
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, socket.SOCK_STREAM)
@@ -195,7 +195,7 @@ def serve(listener: socket.socket, planner: Planner, pose_s: float = POSE_S) -> 
 
 
 def _compute(exchange: Exchange, planner: Planner) -> None:
-    """One question after the other, until there are no more.
+    """Answer one question after the other, until there are no more.
 
     A target is followed by its client's needle at once: one that moves faster than its map is made would be asked about
     forever, and the needle never.
@@ -238,7 +238,7 @@ def _notice_the_vanished(connection: socket.socket) -> None:
 
 
 class Client:
-    """One connection."""
+    """One connection, with threads that read and send."""
 
     def __init__(
         self, number: int, connection: socket.socket, where: str, planner: Planner, exchange: Exchange, log: Log
@@ -270,7 +270,7 @@ class Client:
         self._out.close()
 
     def _end(self, code: str, why: str) -> None:
-        """End it, once; an empty reason is not worth a line."""
+        """End the connection, once; an empty reason is not worth a line."""
         if self._exchange.drop(self._number):
             if why:
                 self._line(code, f"{why}; disconnected")
@@ -302,7 +302,7 @@ class Client:
             self._broken(error, "half_a_message", f"a message is not whole after {MESSAGE_S:g} s")
 
     def _broken(self, error: OSError, code: str, late: str) -> None:
-        """End it after an error; that of a wait which was too long has no number of the system's."""
+        """End the connection after an error; that of a wait which was too long has no number of the system's."""
         if isinstance(error, TimeoutError) and error.errno is None:
             self._end(code, late)
         else:

@@ -1,1 +1,1 @@
-"""The command ``reproduce``: a paper's printed numbers beside ours."""
+"""The command ``reproduce``: a paper's printed numbers compared with ours."""

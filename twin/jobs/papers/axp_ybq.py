@@ -54,8 +54,8 @@ SCALE_LIMIT_MM = 0.25  # with the pixel size estimated; the known number is 0.23
 
 
 def _row(what: str, known: float | None, ours: float, limit: float | None, unit: str) -> dict[str, Any]:
-    holds = limit is None or ours <= limit
-    return {"what": what, "known": known, "ours": ours, "limit": limit, "unit": unit, "holds": holds}
+    satisfied = limit is None or ours <= limit
+    return {"what": what, "known": known, "ours": ours, "limit": limit, "unit": unit, "holds": satisfied}
 
 
 class _Run(NamedTuple):
@@ -71,9 +71,9 @@ def reproduce(seeds: int | None) -> Answer:
     runs, worst = seeds or RUNS, 0.0
     for n in (16, 20, 50):  # the closed form without noise: the largest error of any unknown
         recording, truth = simulate_recording(np.random.default_rng([SEED, n]), n, noise=None)
-        found, exact = equation.closed_form(recording), truth_estimate(truth)
-        turns = [log_rotation(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
-        moves = [found.t_X - exact.t_X, found.t_Y - exact.t_Y, found.t_Q - exact.t_Q]
+        estimate, exact = equation.closed_form(recording), truth_estimate(truth)
+        turns = [log_rotation(a.T @ b) for a, b in ((estimate.R_X, exact.R_X), (estimate.R_Y, exact.R_Y))]
+        moves = [estimate.t_X - exact.t_X, estimate.t_Y - exact.t_Y, estimate.t_Q - exact.t_Q]
         worst = max(worst, float(np.degrees(np.abs(turns).max())), float(np.abs(moves).max()))
     what = "closed form without noise, 16, 20 and 50 poses: largest error"
     rows = [_row(what, None, worst, 1e-6, "mm or deg"), *_table(runs), *_outliers(runs), *_scales(runs)]
@@ -83,12 +83,12 @@ def reproduce(seeds: int | None) -> Answer:
 
 def summary(rows: Sequence[Mapping[str, Any]], runs: int) -> dict[str, Any]:
     """The rows, and whether every number that has a limit is within it."""
-    holds = all(row["holds"] for row in rows)
-    return {"compared_with": COMPARED_WITH, "rows": list(rows), "runs": runs, "seed": SEED, "holds": holds}
+    satisfied = all(row["holds"] for row in rows)
+    return {"compared_with": COMPARED_WITH, "rows": list(rows), "runs": runs, "seed": SEED, "holds": satisfied}
 
 
 def truth_estimate(truth: SimulatedTruth) -> equation.Estimate:
-    """The truth in the form of an estimate."""
+    """The ground truth in the form of an estimate."""
     X, Y = truth.X, truth.Y
     return equation.Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.direction_end2)
 
@@ -96,8 +96,8 @@ def truth_estimate(truth: SimulatedTruth) -> equation.Estimate:
 def _table(runs: int) -> list[dict[str, Any]]:
     rows = []
     for n in COUNTS:
-        found = [_run(np.random.default_rng([SEED, n, k]), n) for k in range(runs)]
-        squares = np.array([run.squared for run in found])
+        simulated = [_run(np.random.default_rng([SEED, n, k]), n) for k in range(runs)]
+        squares = np.array([run.squared for run in simulated])
         ours = np.sqrt(np.mean(squares, axis=0))
         for column, (method, known, error) in enumerate(zip(METHODS, TABLE[n], ours.tolist(), strict=True)):
             limits = [LIMITS.get((n, method), np.inf), OVER_BOUND.get(method, np.inf) * float(ours[3])]
@@ -105,16 +105,16 @@ def _table(runs: int) -> list[dict[str, Any]]:
             limit = least * widened(squares[:, column]) if np.isfinite(least) else None
             rows.append(_row(f"{n} poses, {method}", known, error, limit, "mm"))
         if n >= 20:
-            rows.append(_row(f"{n} poses, most steps", None, max(run.steps for run in found), MOST_STEPS, "steps"))
+            rows.append(_row(f"{n} poses, most steps", None, max(run.steps for run in simulated), MOST_STEPS, "steps"))
         if n == 30:
-            turns = np.array([run.direction_deg**2 for run in found])
+            turns = np.array([run.direction_deg**2 for run in simulated])
             angle, limit = float(np.sqrt(np.mean(turns))), 0.2 * widened(turns)
             rows.append(_row("30 poses, needle direction V", None, angle, limit, "deg"))
     return rows
 
 
 def widened(squares: Floats) -> float:
-    """What a limit of a root mean square is multiplied by: 1 from 200 runs on, more where chance alone does more.
+    """Factor of the limit of a root mean square: 1 from 200 runs on, more where chance alone does more.
 
     Two standard errors of the root mean square of so few runs, less what 200 of them have; squares (runs,).
     """
@@ -142,7 +142,7 @@ def _squared(estimate: equation.Estimate, unseen: Recording) -> float:
 
 
 def _outliers(runs: int) -> list[dict[str, Any]]:
-    """30 poses, 10 % of the tips 5 mm off in the image."""
+    """Rows of 30 poses, 10 % of whose tips are 5 mm off in the image."""
 
     def one(rng: np.random.Generator) -> list[float]:
         recording, truth = simulate_recording(rng, 30)
@@ -151,7 +151,7 @@ def _outliers(runs: int) -> list[dict[str, Any]]:
         active = equation.active_columns(scale=False, direction=False)
         plain = plain_fit(equation.Problem(broken, equation.UNWEIGHTED, active), equation.closed_form(broken))
         unweighted, weighted = (calibrate(broken, noise=noise, direction=False) for noise in (None, SPEC_NOISE))
-        return [_squared(found.estimate, unseen) for found in (plain, unweighted, weighted)]
+        return [_squared(fit.estimate, unseen) for fit in (plain, unweighted, weighted)]
 
     (plain, unweighted, weighted), widen = _rms(one, runs, 1)
     return [
@@ -171,7 +171,7 @@ def with_outliers(rng: np.random.Generator, recording: Recording, fraction: floa
 
 
 def _scales(runs: int) -> list[dict[str, Any]]:
-    """30 poses, the pixels 1 and 3 % larger than believed."""
+    """Rows of 30 poses, whose pixels are 1 and 3 % larger than believed."""
     rows = []
     for percent, known in ((1, 0.33), (3, 0.78)):
         size = 1 + percent / 100
@@ -180,19 +180,19 @@ def _scales(runs: int) -> list[dict[str, Any]]:
             exact, truth = simulate_recording(rng, 30)
             unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
             believed, seen = (Recording(r.A, r.B, r.P / size, r.v) for r in (exact, unseen))
-            found = [calibrate(believed, direction=False, scale=estimated) for estimated in (False, True)]
-            return [_squared(calibration.estimate, seen) for calibration in found]
+            calibrations = [calibrate(believed, direction=False, scale=estimated) for estimated in (False, True)]
+            return [_squared(calibration.estimate, seen) for calibration in calibrations]
 
-        (blind, found), widen = _rms(one, runs, 100 + percent)
+        (blind, corrected), widen = _rms(one, runs, 100 + percent)
         rows += [
             _row(f"30 poses, pixels {percent} % off, not estimated", known, blind, None, "mm"),
-            _row(f"30 poses, pixels {percent} % off, estimated", 0.239, found, SCALE_LIMIT_MM * widen[1], "mm"),
+            _row(f"30 poses, pixels {percent} % off, estimated", 0.239, corrected, SCALE_LIMIT_MM * widen[1], "mm"),
         ]
     return rows
 
 
 def _rms(one: Callable[[np.random.Generator], list[float]], runs: int, key: int) -> tuple[list[float], list[float]]:
-    """Root mean squares of what a run gives, and what their limits are multiplied by."""
+    """Root mean squares of a run's errors, and the factors of their limits."""
     squared = np.array([one(np.random.default_rng([SEED, key, k])) for k in range(runs)])
     return np.sqrt(np.mean(squared, axis=0)).tolist(), [widened(column) for column in squared.T]
 
@@ -207,9 +207,9 @@ FIELDS = (
 )
 
 
-def reproduction_text(found: Mapping[str, Any]) -> str:
+def reproduction_text(facts: Mapping[str, Any]) -> str:
     """For a person: the specified numbers beside ours."""
-    verdict = "all within their limits" if found["holds"] else "NOT all within their limits"
+    verdict = "all within their limits" if facts["holds"] else "NOT all within their limits"
     wider = f"; the limits are those of {RUNS} runs, widened for the chance of fewer runs"
-    ending = f"{found['runs']} runs per row, seed {found['seed']}: {verdict}{'' if found['runs'] >= RUNS else wider}"
-    return text([Section(f"compared with {COMPARED_WITH}", [grid(FIELDS, found["rows"])]), Section(ending, [])])
+    ending = f"{facts['runs']} runs per row, seed {facts['seed']}: {verdict}{'' if facts['runs'] >= RUNS else wider}"
+    return text([Section(f"compared with {COMPARED_WITH}", [grid(FIELDS, facts["rows"])]), Section(ending, [])])

@@ -62,7 +62,7 @@ def reproduce() -> Answer:
 
 
 def reproduction_facts() -> dict[str, Any]:
-    """Every printed quantity beside ours, mm, and the finding about the worked pose: out of a UR3's reach."""
+    """Every printed quantity and ours, mm, and the finding about the worked pose: out of a UR3's reach."""
     first = fit_triad(_points(chen.TABLE_1, "ABC"), _points(chen.TABLE_2, "ABC"))
     second = {
         names: (fit_triad if len(names) == 3 else fit_affine)(
@@ -102,10 +102,10 @@ def _rows(
 
 
 def _row(table: str, what: str, paper: Any, ours: Any) -> dict[str, Any]:
-    """One printed quantity, a point or a distance; it holds where every number agrees to the paper's rounding."""
+    """One printed quantity, a point or a distance; satisfied where every number agrees to the paper's rounding."""
     theirs, own = np.atleast_1d(paper).astype(float), np.atleast_1d(ours).astype(float)
-    holds = bool(np.abs(theirs - own).max() <= TOLERANCE_MM + _ROUNDING)
-    return {"table": table, "what": what, "paper_mm": theirs.tolist(), "ours_mm": own.tolist(), "holds": holds}
+    satisfied = bool(np.abs(theirs - own).max() <= TOLERANCE_MM + _ROUNDING)
+    return {"table": table, "what": what, "paper_mm": theirs.tolist(), "ours_mm": own.tolist(), "holds": satisfied}
 
 
 def _points(table: Mapping[str, chen.Point], names: str) -> Floats:
@@ -144,14 +144,14 @@ FIELDS = (
 )
 
 
-def reproduction_text(found: Mapping[str, Any]) -> str:
-    """The paper's numbers beside ours."""
+def reproduction_text(document: Mapping[str, Any]) -> str:
+    """Text of the paper's numbers and ours."""
     reach = (
         "the worked example puts the flange {flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, whose links "
         "span {longest_span_mm:.1f} mm at most: it is "
-    ).format(**found) + ("out of reach" if found["out_of_reach"] else "within reach")
-    verdict = "all within their limits" if found["holds"] else "NOT all within their limits"
-    return text([Section("Chen et al. 2019, and ours", [grid(FIELDS, found["rows"]), reach]), Section(verdict, [])])
+    ).format(**document) + ("out of reach" if document["out_of_reach"] else "within reach")
+    verdict = "all within their limits" if document["holds"] else "NOT all within their limits"
+    return text([Section("Chen et al. 2019, and ours", [grid(FIELDS, document["rows"]), reach]), Section(verdict, [])])
 
 
 def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
@@ -160,8 +160,8 @@ def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
     It holds where the stated errors are rejected, and the found ones explain every number.
     """
     declared = (chen.AS_STATED, chen.AS_FOUND)
-    stated, found = (chen.run_draws(one, draws or DRAWS, np.random.default_rng(SEED)) for one in declared)
-    facts = experiment_facts(stated, found)
+    stated, fitted = (chen.run_draws(one, draws or DRAWS, np.random.default_rng(SEED)) for one in declared)
+    facts = experiment_facts(stated, fitted)
     shown = experiment_text(facts)
     if runs:
         from puncture_twin.planning.search.context import prepare
@@ -172,10 +172,10 @@ def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
     return Answer(facts["holds"], facts, shown)
 
 
-def experiment_facts(stated: chen.Experiment, found: chen.Experiment) -> dict[str, Any]:
+def experiment_facts(stated: chen.Experiment, fitted: chen.Experiment) -> dict[str, Any]:
     """Plain values for ``--json``, mm and degrees."""
     skew, declarations = chen.find_skew(), []
-    for one in (stated, found):
+    for one in (stated, fitted):
         declared = plain(one.declaration)
         declared["skew_deg"] = float(np.degrees(declared.pop("skew")))
         declared |= {"printed": plain(one.printed), "joint": plain(one.joint), "probability": one.probability}
@@ -191,20 +191,20 @@ def experiment_facts(stated: chen.Experiment, found: chen.Experiment) -> dict[st
             {"what": name, "as_read_mm": read, "square_mm": square} for name, (read, square) in skew.lesions.items()
         ],
         "several_triads": [
-            {"what": name, "paper_mm": paper, "drawn_rms_mm": drawn} for name, (paper, drawn) in found.several.items()
+            {"what": name, "paper_mm": paper, "drawn_rms_mm": drawn} for name, (paper, drawn) in fitted.several.items()
         ],
-        "holds": stated.rejected and found.agrees,
+        "holds": stated.rejected and fitted.agrees,
     }
 
 
 def experiment_text(facts: Mapping[str, Any]) -> str:
-    """The finding first, then the numbers behind it."""
-    (stated, found), strains = facts["declarations"], facts["strain_share"]
+    """Text of the experiment: the finding first, then the numbers behind it."""
+    (stated, fitted), strains = facts["declarations"], facts["strain_share"]
     others = max(value for name, value in strains.items() if name != "y against z")
     verdicts = [
         f"stated: p {stated['probability']:.1g}, {'REJECTED' if stated['rejected'] else 'not rejected'} "
         f"(below {chen.REJECTED:g}): slices of 5 mm cannot give the smallest residuals along the bed.",
-        f"found: p {found['probability']:.2g}; every number within its range: {'yes' if found['agrees'] else 'NO'} "
+        f"found: p {fitted['probability']:.2g}; every number within its range: {'yes' if fitted['agrees'] else 'NO'} "
         "(fitted to these points: consistent, but no proof)",
         f"a skew of the CT's y against z alone takes {100 * strains['y against z']:.0f} % of the squared residuals, "
         f"no other strain more than {100 * others:.0f} %; under the stated errors some strain takes as much in "
@@ -222,11 +222,11 @@ def experiment_text(facts: Mapping[str, Any]) -> str:
         f"the experiment of Chen 2019, simulated {facts['draws']} times with two declarations (seed {facts['seed']})"
     )
     return text([
-        Section(title, [_declared(stated), _declared(found)]),
+        Section(title, [_declared(stated), _declared(fitted)]),
         Section("percentile of the paper's number among the simulated ones",
-                [_ranks(stated["printed"], found["printed"])]),
+                [_ranks(stated["printed"], fitted["printed"])]),
         Section("all points of both setups together, squares in mm^2 (x lies along the bed)",
-                [_ranks(stated["joint"], found["joint"]), *verdicts]),
+                [_ranks(stated["joint"], fitted["joint"]), *verdicts]),
         Section(skew, ["{what}: {as_read_mm:.2f} -> {square_mm:.2f} mm".format(**one) for one in facts["lesions"]]),
         Section("lesion M of setup 2 by several triads, mm: by the paper's points, and rms of the draws as found",
                 [grid(SEVERAL, facts["several_triads"])]),
@@ -234,15 +234,15 @@ def experiment_text(facts: Mapping[str, Any]) -> str:
     ])  # fmt: skip
 
 
-def _ranks(stated: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> Table:
-    """The statistic's size depends on the declaration for chi-squared alone."""
+def _ranks(stated: Sequence[Mapping[str, Any]], fitted: Sequence[Mapping[str, Any]]) -> Table:
+    """Table of ranks; the statistic's size depends on the declaration for chi-squared alone."""
     fields = (
         Field("number of the paper", lambda two: two[0]["name"]),
         Field("paper", lambda two: " and ".join(dict.fromkeys(f"{one['paper']:.2f}" for one in two))),
         Field("stated", lambda two: two[0]["percentile"], 1),
         Field("found", lambda two: two[1]["percentile"], 1),
     )
-    return grid(fields, zip(stated, found, strict=True))
+    return grid(fields, zip(stated, fitted, strict=True))
 
 
 def _declared(one: Mapping[str, Any]) -> str:

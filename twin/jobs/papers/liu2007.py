@@ -47,11 +47,11 @@ Facts = Mapping[str, Any]  # what `reproduction_facts` returns: mm, shares 0..1
 
 
 def reproduce(out_dir: Path, seeds: int | None) -> Answer:
-    """Hold so many of the paper's sessions in the twin, print its tables beside ours, and write pictures and page."""
+    """Run so many of the paper's sessions in the twin, compare its tables with ours, and write pictures and page."""
     with writing(out_dir, "reproduce", names=job.NAMES) as draft:
         case, count = paper_case(), seeds or DEFAULT_SEEDS
         draft.inputs = case.inputs
-        erring, smooth = job.hold_sessions(case, count), job.hold_sessions(with_smooth_gears(case), count)
+        erring, smooth = job.run_sessions(case, count), job.run_sessions(with_smooth_gears(case), count)
         facts = reproduction_facts(erring, smooth)
         written = job.session_files(erring, facts, draft.folder, paper_sections(facts))
     facts["files"] = [str(path) for path in draft.final(written)]
@@ -59,7 +59,7 @@ def reproduce(out_dir: Path, seeds: int | None) -> Answer:
 
 
 def paper_case() -> ServoCase:
-    """The embedded room like the paper's: the arm's gears err."""
+    """The embedded workcell like the paper's: the arm's gears err."""
     return load_servo_case(folder() / "head" / CASE)
 
 
@@ -70,7 +70,7 @@ def with_smooth_gears(case: ServoCase) -> ServoCase:
 
 
 def reproduction_facts(erring: job.Sessions, smooth: job.Sessions) -> dict[str, Any]:
-    """The paper's tables, and our sessions in a room like the paper's; in the same rooms without errors of gears."""
+    """The paper's tables, our sessions in a workcell like the paper's, and the same without errors of gears."""
     errors, demanded = erring.case.errors, conditions(erring)
     rows = np.array(TABLE_2)
     return {
@@ -92,13 +92,13 @@ def reproduction_facts(erring: job.Sessions, smooth: job.Sessions) -> dict[str, 
 def paper_columns() -> list[dict[str, Any]]:
     """Stereo, mapping, before, after: mean and maximum as the paper prints them, and as its own rows give them; mm."""
     columns = [np.array(TABLE_1), *np.array(TABLE_2).T]
-    found = []
+    rows = []
     for name, printed, values in zip(COLUMNS, (TABLE_1_PRINTED, *TABLE_2_PRINTED), columns, strict=True):
         own = float(values.mean()), float(values.max())
         wrong = max(abs(a - b) for a, b in zip(own, printed, strict=True))
         means = {"printed_mean": printed[0], "mean": own[0], "printed_max": printed[1], "max": own[1]}
-        found.append({"name": name, **means, "holds": wrong <= ROUNDING_MM + 1e-9})
-    return found
+        rows.append({"name": name, **means, "holds": wrong <= ROUNDING_MM + 1e-9})
+    return rows
 
 
 def paper_servo_only_at_least() -> list[float]:
@@ -107,7 +107,7 @@ def paper_servo_only_at_least() -> list[float]:
 
 
 def conditions(sessions: job.Sessions) -> list[dict[str, Any]]:
-    """What must be so for the paper's finding to hold in our room; each allows for two standard errors."""
+    """Conditions of the paper's finding in our workcell; each allows for two standard errors."""
     ours, fall = sessions.ours, gain(sessions.trials)
     over = mean_of_seeds(sessions.trials, lambda row: row.after_mm - row.mapping_mm)["error"]
     after, lost = ours["after_mean"], ours["not_confirmed"]
@@ -121,11 +121,11 @@ def conditions(sessions: job.Sessions) -> list[dict[str, Any]]:
         f"after the servo, {after:.2f} mm, is at most {most:.2f} (1.1 times the mapping's, plus chance)": after <= most,
         f"not confirmed, {100 * lost:.1f} %, is at most {100 * fraction:.0f} % of the targets": lost <= fraction,
     }
-    return [{"words": words, "holds": bool(holds)} for words, holds in demanded.items()]
+    return [{"words": words, "holds": bool(satisfied)} for words, satisfied in demanded.items()]
 
 
 def gain(trials: Sequence[ServoTrial]) -> dict[str, float]:
-    """By how much the error falls from before to after the servo, mm."""
+    """Fall of the error from before to after the servo, mm."""
     return mean_of_seeds(trials, lambda row: row.before_mm - row.after_mm)
 
 

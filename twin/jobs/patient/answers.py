@@ -33,7 +33,7 @@ from puncture_twin.planning.registration.registration import Registration, regis
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts
-from puncture_twin.twin.jobs.patient.run import plain_of, registration_summary
+from puncture_twin.twin.jobs.patient.run import plain_fields, registration_summary
 from puncture_twin.twin.report import patient
 from puncture_twin.twin.report.present import Field, Section, Table, Warn, facts, text, vector
 
@@ -50,8 +50,8 @@ def registration_report(path: Path) -> dict[str, Any]:
         raise InputListError("; ".join((what, *compared)), where=case.path, allowed=allowed, code="no_markers")
     registration, kinds = checked.placement.registration, (Severity.WARNING, Severity.NOTE)
     warned, notes = ([one.sentence for one in checked.findings if one.severity is kind] for kind in kinds)
-    odd = odd_branches(registration, case.robot.model)
-    touched = f"{', '.join(odd)} touched in another branch of the arm than the rest: arm errors do not cancel there"
+    unlike = odd_branches(registration, case.robot.model)
+    touched = f"{', '.join(unlike)} touched in another branch of the arm than the rest: arm errors do not cancel there"
     along = np.linspace(case.target_ct, case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2], 4)
     stated = {
         "case": case.name,
@@ -64,7 +64,7 @@ def registration_report(path: Path) -> dict[str, Any]:
     return {
         **report,
         "expected_tre_along_shaft_mm": registration.expected_tre_mm(along).tolist(),
-        "warnings": [*case.warnings, *warned, *([touched] if odd else [])],
+        "warnings": [*case.warnings, *warned, *([touched] if unlike else [])],
         **_advice_of_case(case, registration),
         "notes": notes,
     }
@@ -114,7 +114,7 @@ def _report(
 
 
 def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Floats | None) -> dict[str, Any]:
-    """Within which of its true place a target (3,), mm, is sent to in 95 of 100 registrations, its own reading in it.
+    """Distance from the true target (3,), mm, within which 95 of 100 registrations send the tip, its own reading in it.
 
     `read_cov_ct`, (3, 3), mm^2, is of that reading, as declared; None where it is read as a marker is, in both lists.
     """
@@ -128,7 +128,7 @@ def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Fl
 
 
 def noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | None:
-    """Equal in all axes, of both lists together, stated or to be found; None where they agree to rounding."""
+    """Noise equal in all axes, of both lists together, stated or to be estimated; None where they agree to rounding."""
     if fle_mm is None and rigid_fre_mm(pairs.points_ct, pairs.points_base) < LEAST_FOUND_MM:
         return None
     count = len(pairs)
@@ -147,11 +147,11 @@ def _advice_of_lists(registration: Registration, target_ct: Floats, space: Space
     sides /= np.linalg.norm(sides, axis=1, keepdims=True)
     test = registration.uncertainty.test
     stated = test.text().replace("the declared errors", "--fle")
-    found = f"noise estimated from the residuals: {registration.fle_mm:.3f} mm, with {test.freedom} degrees of freedom"
+    noise = f"noise estimated from the residuals: {registration.fle_mm:.3f} mm, with {test.freedom} degrees of freedom"
     return {
         "budget": None,
         "fle_source": "estimated from the FRE of the rigid fit" if test.scaled else "stated by --fle",
-        "declaration": {**registration_summary(registration)["declaration"], "text": found if test.scaled else stated},
+        "declaration": {**registration_summary(registration)["declaration"], "text": noise if test.scaled else stated},
         **_advice(registration, target_ct, space, target_ct + far * sides, {"the markers in both lists": 1.0}),
     }
 
@@ -160,17 +160,17 @@ def _advice_of_case(case: Case, registration: Registration) -> dict[str, Any]:
     if registration.uncertainty is None:
         return {}
     read, touched = map(np.trace, registration.uncertainty.parts_at(apply(registration.T_base_ct, case.target_ct)))
-    share = {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))}
+    fractions = {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))}
     touchable = touchable_points(case, load_skin(case, user_cache()).mesh, registration.T_base_ct)
     return {
         "budget": budget_facts(case, registration, touchable, partial(load_anatomy, case, cache=user_cache())),
         **({} if registration.aim is None else {"correction": correction_facts(case, registration)}),
-        **_advice(registration, case.target_ct, case.space, touchable, share),
+        **_advice(registration, case.target_ct, case.space, touchable, fractions),
     }
 
 
 def _advice(
-    registration: Registration, target_ct: Floats, space: Space, places_ct: Floats, share: dict[str, float]
+    registration: Registration, target_ct: Floats, space: Space, places_ct: Floats, fractions: dict[str, float]
 ) -> dict[str, Any]:
     """The target's ellipsoid, the rest without each marker, and at which of the places (n, 3) one more helps most."""
     assert registration.uncertainty is not None
@@ -184,7 +184,7 @@ def _advice(
         "half_axes_95_mm": (
             registration.uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])
         ).tolist(),
-        "share": share,
+        "share": fractions,
         "without": {one.name: {"rms_mm": one.rms_mm, "probability": one.probability} for one in without},
         "one_more": best,
     }
@@ -192,10 +192,10 @@ def _advice(
 
 def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
     """Prove every cell of a certificate again, by the plain checker; one that does not follow is refused."""
-    found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
-    stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
-    if found.note:
-        context.watcher.note(f"warning: {found.note}")
+    output = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
+    stated, certificate = output.input("certificate"), parse_certificate(output.data, path)
+    if output.note:
+        context.watcher.note(f"warning: {output.note}")
     cells, error = partial(context.watcher.count, "cells"), context.pose_error
     done = verify(certificate, context.case, context.anatomy, cells, error=error)
     inputs = inputs_document((stated, *context.case.inputs))
@@ -203,14 +203,14 @@ def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
 
 
 def certificate_text(report: dict[str, Any]) -> str:
-    """What the plain checker proved."""
+    """Text of the plain checker's proof."""
     done = report["verified"]
     proven = f"{done['safe']} safe and {done['rejected']} rejected cells proven again, {done['undecided']} undecided"
     return text([Section(f"{report['certificate']}: every cell is proven", [proven, *patient.certificate(report)])])
 
 
 def registration_text(report: dict[str, Any]) -> str:
-    """Residuals, expected error, weak points and error budget of a registration."""
+    """Text of a registration: residuals, expected error, ill-conditioned markers and error budget."""
     target = f", target {vector(report['target_mm'], 1, 'mm')} {report['space']}" if "target_mm" in report else ""
     return text([
         Section(f"case {report['case']}: registration{target}", patient.registration(report)),
@@ -224,24 +224,24 @@ def parse_noise(words: str | None) -> HandEyeNoise | None:
     return None if words is None else noise_of([parse_coordinate(one.strip(), "--noise") for one in words.split(",")])
 
 
-def hand_eye_summary(found: HandEye) -> dict[str, Any]:
-    """What was found, mm and degrees."""
-    half = found.intervals()
+def hand_eye_summary(fit: HandEye) -> dict[str, Any]:
+    """A hand-eye calibration as plain values, mm and degrees."""
+    half = fit.intervals()
     half = np.where(np.arange(len(half)) % 6 < 3, np.degrees(half), half)
-    rad, mm = found.spread
+    rad, mm = fit.spread
     return {
-        "equation": "AX = XB" if found.Z is None else "AX = ZB",
-        "T_flange_camera": found.X.tolist(),
-        "T_base_board": None if found.Z is None else found.Z.tolist(),
-        "poses": len(found.names),
+        "equation": "AX = XB" if fit.Z is None else "AX = ZB",
+        "T_flange_camera": fit.X.tolist(),
+        "T_base_board": None if fit.Z is None else fit.Z.tolist(),
+        "poses": len(fit.names),
         "interval_95": {
             f"T_{name}": {"rotation_deg": half[at : at + 3].tolist(), "translation_mm": half[at + 3 : at + 6].tolist()}
             for name, at in zip(("flange_camera", "base_board"), range(0, len(half), 6), strict=False)
         },
         "residual_deg": float(np.degrees(rad)),
         "residual_mm": mm,
-        **plain_of(found, "chi_squared", "freedom", "condition", "covariance"),
-        "findings": [one.document() for one in found.findings()],
+        **plain_fields(fit, "chi_squared", "freedom", "condition", "covariance"),
+        "findings": [one.document() for one in fit.findings()],
     }
 
 

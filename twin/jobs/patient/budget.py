@@ -40,7 +40,7 @@ def budget_facts(
     bed = None if case.space is Space.LOCAL else np.array([0.0, 0.0, 1.0])
     if values[2] > values[1] * (1 + 1e-9):  # across the slices a marker is read worst
         bed = np.asarray(axes[:, 2])
-    found, square = changes(chain, places_ct, bed), chain.tip_mean_square()
+    options, square = changes(chain, places_ct, bed), chain.tip_mean_square()
     along_base = flange_pose(chain.model, chain.q_insertion)[:3, 2]
     depth = float(along_base @ square @ along_base)
     counted = {"breathing": chain.breathing, "bending": chain.path, "motion": chain.motion_base}
@@ -54,8 +54,8 @@ def budget_facts(
             {"text": SOURCES[one.source].text, "alone_mm": one.alone_mm, "without_mm": one.without_mm}
             for one in source_costs(chain)
         ],
-        "changes": [_change(case, one) for one in found],
-        "best": _change(case, best_change(found)),
+        "changes": [_change(case, one) for one in options],
+        "best": _change(case, best_change(options)),
         "not_modelled": not_modelled(case, counted=[name for name, one in counted.items() if one is not None]),
     }
 
@@ -76,7 +76,7 @@ def budget_chain(
 
 
 def needle_angles(case: Case, registration: Registration, q: Floats) -> dict[str, Any]:
-    """Of the direction from which the needle comes in a configuration (6,), rad."""
+    """Angles of the direction from which the needle comes in a configuration (6,), rad."""
     outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(case.robot.model, q)[:3, 2])
     theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
     return {"theta_deg": float(np.degrees(theta)), "beta_deg": float(np.degrees(beta)) if theta > POLE else 0.0}
@@ -102,12 +102,12 @@ def correction_facts(case: Case, registration: Registration) -> dict[str, Any] |
         noise_found=case.errors.found, accept_residuals=True,
     )  # fmt: skip
     shift = apply(registration.T_base_ct, aim.target_ct) - apply(other.T_base_ct, aim.target_ct)
-    turn = registration.T_base_ct[:3, :3] @ other.T_base_ct[:3, :3].T
+    rotation = registration.T_base_ct[:3, :3] @ other.T_base_ct[:3, :3].T
     return {
         **needle_angles(case, registration, aim.q),
         "joints_deg": np.degrees(aim.q).tolist(),
         "moved_mm": float(np.linalg.norm(shift)),
-        "turned_deg": float(np.degrees(np.linalg.norm(log_rotation(turn)))),
+        "turned_deg": float(np.degrees(np.linalg.norm(log_rotation(rotation)))),
         "expected_mm": _expected_mm(case, registration, aim.q),
         "uncorrected_method": method,
         "uncorrected_mm": _expected_mm(case, other, aim.q),

@@ -29,7 +29,7 @@ from puncture_twin.twin.guidance.ct.needle import needle_error, read_needle
 from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.guidance.ct.tie import Body, Tie, body_of, tie_frames
 from puncture_twin.twin.jobs.patient.main_job import read_noted_plan
-from puncture_twin.twin.jobs.patient.run import writing_of
+from puncture_twin.twin.jobs.patient.run import case_draft
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report import present
 from puncture_twin.twin.report.present import Card, Field, Section, facts, grid, number, percent, vector
@@ -46,14 +46,14 @@ class Confirmed(Shown):
 
     context: CaseContext
     plan: Plan | None
-    """To which it is compared, or None."""
+    """The plan to which the needle is compared, or None."""
     volume: Volume
     tie: Tie
     needle: FoundNeedle
-    """Its covariance is that of the reading and of the frames' tie together."""
+    """The needle that was read, with the covariance of the reading and of the frames' tie together."""
     line: LineCheck
     aims: tuple[Aim, ...]
-    """What can be done, the best first."""
+    """Possible next aims, the best first."""
     findings: tuple[Finding, ...]
     read: tuple[Input, ...]
     files: tuple[Path, ...] = ()
@@ -198,7 +198,7 @@ AIMS = (
 
 
 def aim_text(aim: Aim) -> str:
-    """What to do, in words."""
+    """An aim in words."""
     if aim.kind == "accept":
         return "accept"
     if aim.kind == "deeper":
@@ -247,7 +247,7 @@ def confirm_case(context: CaseContext, scan: Path, out: Path, plan_path: Path | 
     from puncture_twin.twin.jobs.patient.pictures import draw_confirmed  # with matplotlib: not before a refusal
 
     planned = next((one for one in done.read if one.role == "plan"), None)
-    with writing_of(context, out, "confirm", FILES, done.read, planned) as draft:
+    with case_draft(context, out, "confirm", FILES, done.read, planned) as draft:
         draw_confirmed(done, draft.folder / PICTURE)
         _write_page(done, draft.folder)
         done = replace(done, files=draft.final(tuple(draft.folder / name for name in FILES)))
@@ -297,8 +297,8 @@ def _write_page(done: Confirmed, folder: Path) -> None:
         Card("next", best.kind, aim_text(best).removeprefix("accept"), best.kind == "withdraw"),
         Card("chance to hit now", percent(next((one.p_hit for one in done.aims if one.kind == "accept"), 0.0)), ""),
     ]
-    found = tuple(one.sentence for one in done.findings)
-    warned = [Section("warnings", [present.Warn(found)])] if found else []
+    sentences = tuple(one.sentence for one in done.findings)
+    warned = [Section("warnings", [present.Warn(sentences)])] if sentences else []
     shown = present.picture(folder / PICTURE, "slices along the needle")
     sections = [*warned, *done.sections(), Section("slices of the control scan", [shown, PICTURE_TEXT])]
     inputs = (*done.read, *done.context.case.inputs)
@@ -314,7 +314,7 @@ PICTURE_TEXT = (
 
 
 class Learned(NamedTuple):
-    """By how much errors exceed what was predicted, of n needles."""
+    """Size of the errors of n needles in terms of the predicted ones."""
 
     needles: int
     factor: float  # of every standard deviation: 1 where the declaration is right; `low` to `high` is its 95 % interval

@@ -42,7 +42,7 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.table import to_table
 from puncture_twin.twin.jobs.patient.main_job import case_of, is_plan, plan_case, read_noted_plan, search_case
-from puncture_twin.twin.jobs.patient.run import writing_of
+from puncture_twin.twin.jobs.patient.run import case_draft
 from puncture_twin.twin.report.present import Block, Section, Warn, text
 
 Note = Callable[[str], None]  # shows one line
@@ -74,23 +74,23 @@ class Written(Shown):
     format_name: str
     files: tuple[Path, ...]
     facts: Mapping[str, Any]
-    """What they hold, as plain values."""
+    """Content of the files, as plain values."""
     said: Sequence[Section]
-    """For a person: the same, and what whoever opens them should know."""
+    """Content for a person, and what whoever opens the files should know."""
     inputs: tuple[Input, ...]
 
     @property
     def path(self) -> Path:
-        """The first of them."""
+        """The first of the files."""
         return self.files[0]
 
     def summary(self) -> dict[str, Any]:
-        """As plain values."""
+        """The export as plain values."""
         inputs, files = inputs_document(self.inputs), [str(file) for file in self.files]
         return {"format": self.format_name, **self.facts, "inputs": inputs, "files": files}
 
     def text(self) -> str:
-        """As lines."""
+        """The export as lines of text."""
         return text(self.said)
 
 
@@ -101,11 +101,11 @@ def _of_path(name: str, files: tuple[Path, ...], path: str, notes: Sequence[str]
     return Written(name, files, facts, [Section(f"{name}: {path}", lines)], inputs)
 
 
-def put(draft: Draft, made: Mapping[str, str | bytes]) -> tuple[Path, ...]:
+def _put(draft: Draft, contents: Mapping[str, str | bytes]) -> tuple[Path, ...]:
     """Write files into a draft; returns where they will lie."""
-    for name, content in made.items():
+    for name, content in contents.items():
         (draft.folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-    return draft.final(draft.folder / name for name in made)
+    return draft.final(draft.folder / name for name in contents)
 
 
 def export_path(
@@ -129,20 +129,20 @@ def export_path(
     if not choice.of_grid:
         choose_stated(context, choice)  # before the search is made for nothing
     names = archive.NAMES if scan is not None else slicer.NAMES
-    with writing_of(context, out, f"export {format_name}", names, (*read, *choice.read)) as draft:
-        found = context.search()
-        chosen = choose(context, found, choice)
+    with case_draft(context, out, f"export {format_name}", names, (*read, *choice.read)) as draft:
+        candidates = context.search()
+        chosen = choose(context, candidates, choice)
         pick = Pick(chosen.candidates, int(chosen.rows[0]))
         name = f"path theta {pick.theta_deg:.6g} beta {pick.beta_deg:.6g}"
-        made: Mapping[str, str | bytes]
+        contents: Mapping[str, str | bytes]
         if scan is None:
-            drawn = SceneContent(name, pick.candidates.path.entry_ct[pick.row], entry_area(found), context.placement)
-            files = slicer_files(case, drawn)
-            made, notes = files.texts, files.notes
+            entry_ct, area = pick.candidates.path.entry_ct[pick.row], entry_area(candidates)
+            files = slicer_files(case, SceneContent(name, entry_ct, area, context.placement))
+            contents, notes = files.texts, files.notes
         else:
-            made, notes = archive.archive_files(scan, _archived(context, scan, found, pick)), (NO_DEVICE,)
-        written = put(draft, made)
-    said = (NO_APPROACH if plan is None else PLANNED, f"arm: {found.arm_note}", *notes)
+            contents, notes = archive.archive_files(scan, _archived(context, scan, candidates, pick)), (NO_DEVICE,)
+        written = _put(draft, contents)
+    said = (NO_APPROACH if plan is None else PLANNED, f"arm: {candidates.arm_note}", *notes)
     return _of_path(format_name, written, name, said, context.anatomy.warnings, inputs)
 
 
@@ -171,12 +171,12 @@ def export_confirmation(source: Path, scan: Path, out: Path, note: Note) -> Writ
         refuse("it is not the scan that was confirmed", scan, "the one that confirm --scan was given", "input_changed")
     said = (("use", NO_DEVICE), *((name, str(value)) for name, value in words.items() if value not in (None, "")))
     rod = archive.Region("needle in the scan", "needle", archive.rod_points(path, radius_mm, archive.finest_mm(series)))
-    made = archive.archive_files(
+    contents = archive.archive_files(
         series, archive.ArchiveContent("Needle confirmed", (rod,), {"needle": path}, quantities, said)
     )
     inputs = (read.input("confirmation"), *files.inputs)
     with writing(out, f"export {archive.DICOM}", inputs=inputs, names=archive.NAMES, note=note) as draft:
-        written = put(draft, made)
+        written = _put(draft, contents)
     return _of_path(archive.DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
 
 
@@ -193,8 +193,8 @@ def _series(case: Case) -> CtSeries:
     return series
 
 
-def _archived(context: CaseContext, scan: CtSeries, found: Candidates, pick: Pick) -> archive.ArchiveContent:
-    case, area = context.case, entry_area(found)
+def _archived(context: CaseContext, scan: CtSeries, candidates: Candidates, pick: Pick) -> archive.ArchiveContent:
+    case, area = context.case, entry_area(candidates)
     entry, target, step = pick.candidates.path.entry_ct[pick.row], case.target_ct, archive.finest_mm(scan)
     of_face = area.window[area.faces[:, 0]] if len(area.faces) else np.zeros(0, np.int64)
     of_window = {k: area.faces[of_face == k] for k in np.unique(of_face).tolist()}
@@ -213,7 +213,7 @@ def _archived(context: CaseContext, scan: CtSeries, found: Candidates, pick: Pic
         (archive.Region("planned needle", "needle", rod), *windows),
         {"path from skin to target": np.stack([entry, target]), "target": target[None]},
         quantities,
-        (("use", NO_DEVICE), ("case", case.name), ("arm", found.arm_note), *sentences),
+        (("use", NO_DEVICE), ("case", case.name), ("arm", candidates.arm_note), *sentences),
     )
 
 
@@ -233,17 +233,17 @@ def table_of(source: Path, choice: Choice) -> Path | None:
 
 def export_candidates(table_path: Path, format_name: str, out: Path, note: Note) -> Written:
     """Write a table of candidates as text, beside its own set or elsewhere."""
-    found = read_output(table_path, max_bytes=MAX_TABLE_BYTES)
-    if found.note:
-        note(f"warning: {found.note}")
+    output = read_output(table_path, max_bytes=MAX_TABLE_BYTES)
+    if output.note:
+        note(f"warning: {output.note}")
     try:
-        table = pq.read_table(pa.BufferReader(found.data))
+        table = pq.read_table(pa.BufferReader(output.data))
     except (pa.ArrowException, OSError) as error:
         what = f"no Parquet file ({str(error)[:100]})"
         raise InputError(what, where=table_path, allowed=ALLOWED, code="not_parquet") from error
     if b"run" not in (table.schema.metadata or {}) or not {*ROUNDED, "verdict"} <= set(table.column_names):
         refuse("no table of candidates", table_path, ALLOWED, "no_such_file")
-    source, run = found.input("candidates"), json.loads(table.schema.metadata[b"run"])
+    source, run = output.input("candidates"), json.loads(table.schema.metadata[b"run"])
     inputs, name = (source, *read_inputs(run["inputs"])), f"candidates.{format_name.removeprefix('candidates-')}"
     columns = {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
     columns |= {name: [round(value, ANGLE_DIGITS) for value in columns[name]] for name in ROUNDED}
@@ -259,7 +259,7 @@ def export_candidates(table_path: Path, format_name: str, out: Path, note: Note)
         raise ArithmeticError(f"{name} does not read back as the table")
     made_from = {source.path: source.sha256}
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
-        files = put(draft, {name: text})
+        files = _put(draft, {name: text})
     said = [Section(f"{format_name}: {len(rows)} rows in {files[0]}", [])]
     return Written(format_name, files, {"rows": len(rows)}, said, inputs)
 
@@ -322,7 +322,7 @@ def export_robot(
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
     with writing(out, f"export {names[0]}", inputs=inputs, names=names, made_from=made_from, note=note) as draft:
         if moves:
-            files, notes = put(draft, moves), MOVEIT_NOTES
+            files, notes = _put(draft, moves), MOVEIT_NOTES
         else:
             checker = None if context is None or context.reach is None else context.reach.checker
             done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)

@@ -30,7 +30,7 @@ READING_BYTES = 3_000_000_000  # what was read is read once: 1,000 slices of 512
 
 @dataclass(frozen=True, eq=False)
 class InitRun:
-    """A case that was written, and what a person should look at."""
+    """A case that was written, and what a person should check."""
 
     path: Path
     start: Start
@@ -92,14 +92,14 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
             points, space = start.seen.points, start.parts.space
             write_points(folder / start.seen.source, replace(points, points=to_lps(points.points, space), space=space))
         draft.write_text(text, encoding="utf-8")
-        found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
+        findings = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     picture = None if context.anatomy.scan is None else folder / SLICES
     if picture is not None:
         from puncture_twin.twin.report.slices.panel import Subject
         from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet  # with matplotlib
 
         write_sheet(draw_slices(Subject(context.case, context.anatomy, None)), picture)
-    return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)
+    return InitRun(path, replace(start, text=text), context, (*start.notes, *findings), picture)
 
 
 def _refuse_options(request: Request) -> None:
@@ -122,7 +122,7 @@ def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
 
 
 def init_text(run: InitRun) -> str:
-    """What was found, and the next command."""
+    """Text of a new case, and the next command."""
     parts, counts = run.start.parts, Counter(row.kind for row in run.start.parts.rows)
     position = ", ".join(f"{one:.1f}" for one in to_lps(parts.target_ct[None], parts.space)[0])
     needle = run.context.case.needle

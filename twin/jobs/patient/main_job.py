@@ -25,23 +25,23 @@ from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
-from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run, writing_of
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, TRIALS, Run, TrialCount, case_draft
 
 CERTIFICATE = "certificate.json"
 CERTIFY_DEG = 0.25  # smallest cell of a certificate where nobody says
 NO_PLAN = "no plan: "  # before the reason, whoever gives it: the choice, or the planner
-DEMO_ROOMS = 1000  # what a stranger sees first is a distribution, where the case declares what it may be off by
+DEMO_TRIALS = 1000  # what a stranger sees first is a distribution, where the case declares what it may be off by
 
 
 class CertifyOptions(NamedTuple):
-    """Of a certificate: the smallest cell, and how often a structure may be touched."""
+    """Options of a certificate: the smallest cell, and how often a structure may be touched."""
 
     size_deg: float
     touch: float | None
 
 
 def certify_options(wanted: bool, size_deg: float | None, touch: float | None) -> CertifyOptions | None:
-    """What is asked of a certificate; None where none is. Options of one that nobody asked for are refused."""
+    """Options of a requested certificate; None without one. Options of one that nobody asked for are refused."""
     for option, value in (("--certify-touch", touch), ("--certify-size", size_deg)):
         if value is not None and not wanted:
             refuse("options of a certificate without --certify", option, "with --certify", "conflicting_options")
@@ -62,7 +62,7 @@ def search_case(
 
         question_of(context.case, context.anatomy)
     names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify is None else (CERTIFICATE,)))
-    with writing_of(context, out, "search", names) as draft:
+    with case_draft(context, out, "search", names) as draft:
         run = Run(context, context.search(), (), checked=checked)
         run = run if certify is None else _certified(run, certify, draft.folder)
         run = _with_table(run, draft.folder)
@@ -74,7 +74,7 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     """Search and plan the best or the chosen candidate. Without a plan the search's files are written all the same."""
     context.require_arm()
     choice = _stated(context, out, choice)
-    with writing_of(context, out, "plan", ("candidates.parquet", "plan.json", *PICTURES), choice.read) as draft:
+    with case_draft(context, out, "plan", ("candidates.parquet", "plan.json", *PICTURES), choice.read) as draft:
         run = Run(context, context.search(), (), read=choice.read)
         run = _planned(run, draft.folder, choice)
         run = _with_table(run, draft.folder)
@@ -82,20 +82,20 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     return _answered(run, draft, out)
 
 
-def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST) -> Run:
-    """Plan, rehearse the plan, in many rooms too beside the one that is filmed, and write everything."""
+def rehearse_case(context: CaseContext, out: Path, trials: TrialCount | None = None, choice: Choice = BEST) -> Run:
+    """Plan, rehearse the plan, in many trials too besides the one that is filmed, and write everything."""
     from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
     context.require_arm()
     choice = _stated(context, out, choice)
-    names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
-    with writing_of(context, out, "plan", names, choice.read) as draft, two_stages() as begin:
+    names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, TRIALS, *PICTURES)
+    with case_draft(context, out, "plan", names, choice.read) as draft, two_stages() as begin:
         run = Run(context, context.search(), (), read=choice.read)
         run = _planned(run, draft.folder, choice)
         run = _with_table(run, draft.folder)
         planned = run.files
-        pending = None if run.plan is None else begin_rehearsal(run, rooms, begin)  # while the pictures are drawn
+        pending = None if run.plan is None else begin_rehearsal(run, trials, begin)  # while the pictures are drawn
         paged = partial(with_page, out=draft.folder, drawn=draw_pictures(run, draft.folder))
         run = paged(run) if pending is None else pending.ended(draft.folder, paged)
         if run.rehearsal is not None:  # the page shows it: it goes with it
@@ -106,20 +106,20 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
 
 def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
     """The case of what is rehearsed, as `case_of`; a plan without its case is refused."""
-    if (found := case_of(source, case, choice)) is None:
+    if (path := case_of(source, case, choice)) is None:
         refuse("a plan needs its case", source, "rehearse plan.json --case CASE", "missing_option")
-    return found
+    return path
 
 
 def demo_case(context: CaseContext, out: Path) -> Run:
-    """`rehearse_case`, in `DEMO_ROOMS` rooms where errors are declared; without a simulator `plan_case`, and a note."""
+    """`rehearse_case` in `DEMO_TRIALS` trials if errors are declared; without a simulator `plan_case`, and a note."""
     try:
         require_extra("twin", "demo")
     except InputError as missing:
         context.watcher.note(f"warning: planned, not rehearsed: {missing}")
         return plan_case(context, out)
-    rooms = None if context.chance is None else RoomCount(DEMO_ROOMS)
-    return rehearse_case(context, out, rooms)
+    trials = None if context.chance is None else TrialCount(DEMO_TRIALS)
+    return rehearse_case(context, out, trials)
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
@@ -142,15 +142,15 @@ def _answered(run: Run, draft: Draft, out: Path) -> Run:
     return replace(run, files=draft.final(run.files))
 
 
-def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:
+def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, trials: TrialCount | None = None) -> Run:
     """Check a written plan again and rehearse it; the scene is left out where the plan's own stands beside it."""
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_parts import Scene
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     source, plan, candidates = checked_plan(context, plan_path)
-    with writing_of(context, out, "rehearse", ("rehearsal.json", FILM, ROOMS), (source,), source) as draft:
-        run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)
+    with case_draft(context, out, "rehearse", ("rehearsal.json", FILM, TRIALS), (source,), source) as draft:
+        run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), trials, partial).ended(draft.folder)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
                 draw_scene(Scene(context.case, context.anatomy, candidates, plan), draft.folder / "scene.png")
@@ -171,16 +171,16 @@ def checked_plan(context: CaseContext, path: Path) -> tuple[Input, Plan, Candida
 
 def read_noted_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
     """A plan of a whole set, or with a warning from outside of any, and the hash of the bytes that it was read from."""
-    found = read_output(path, max_bytes=MAX_PLAN_BYTES)
-    plan = parse_plan(found.data, path)
-    if found.note:
-        note(f"warning: {found.note}")
-    return found.input("plan"), plan
+    output = read_output(path, max_bytes=MAX_PLAN_BYTES)
+    plan = parse_plan(output.data, path)
+    if output.note:
+        note(f"warning: {output.note}")
+    return output.input("plan"), plan
 
 
 def report_case(run: Run, out: Path) -> Run:
     """Write the pictures and the page of what is known."""
-    with writing_of(run.context, out, "report", PICTURES) as draft:
+    with case_draft(run.context, out, "report", PICTURES) as draft:
         run = _with_pictures(run, draft.folder)
     return replace(run, files=draft.final(run.files))
 
@@ -194,9 +194,9 @@ def _certified(run: Run, wanted: CertifyOptions, out: Path) -> Run:
         error, size = context.pose_error, float(np.radians(wanted.size_deg))
         certificate = certify(context.case, context.anatomy, size=size, touch=wanted.touch, error=error)
     with context.stages.time("safe cones"):
-        found = with_safe_cone(context.case, run.candidates, certificate)
+        certified = with_safe_cone(context.case, run.candidates, certificate)
     write_certificate(certificate, out / CERTIFICATE)
-    return replace(run, candidates=found, certificate=certificate).with_files(out / CERTIFICATE)
+    return replace(run, candidates=certified, certificate=certificate).with_files(out / CERTIFICATE)
 
 
 def _planned(run: Run, out: Path, choice: Choice) -> Run:
@@ -206,12 +206,12 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
     context = run.context
     try:
         with context.stages.time("plan"):
-            plan, found, row = make_plan(context, run.candidates, choice)
+            plan, searched, row = make_plan(context, run.candidates, choice)
             plan = with_ways(context, plan)
     except NoAnswerError as error:
         return replace(run, refusal=str(error).removeprefix(NO_PLAN))
     write_plan(plan, out / "plan.json")
-    run = replace(run, plan=plan, pick=Pick(found, row), candidates=found if choice.of_grid else run.candidates)
+    run = replace(run, plan=plan, pick=Pick(searched, row), candidates=searched if choice.of_grid else run.candidates)
     return run.with_files(out / "plan.json")
 
 

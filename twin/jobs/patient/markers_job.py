@@ -35,7 +35,7 @@ from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report.present import Field, Section, Table, facts, footer, grid, number, text, vector
 
 FOUND, PROPOSED, MARKUPS = "markers_ct.csv", "markers_proposed.csv", ".mrk.json"
-"""Never one name for both: a person puts a marker some mm beside its proposed place."""
+"""File names of markers, never one for both: a person puts a marker some mm beside its proposed place."""
 PICTURE, REPORT = "markers.png", "markers.json"
 NEAR_MM, WIDE_MM = 40.0, 160.0  # half a side of each slice: of a marker, and of a place to be found on the body
 CASE = "case.toml"
@@ -46,7 +46,7 @@ ALLOWED = "a folder with one CT, a CT file (NIfTI, NRRD, a DICOM folder), or a c
 def stated_of(
     kind: str | None, diameter_mm: float | None, count: int | None, layout: Path | None, propose: int | None
 ) -> Stated:
-    """What a person says of the markers; nothing of it may stand beside a proposal."""
+    """Statements of a person about the markers; none may accompany a proposal."""
     if propose is not None:
         if any(one is not None for one in (kind, diameter_mm, count, layout)):
             allowed = "--propose alone, or options of the markers that are there"
@@ -81,14 +81,14 @@ def read_source(source: Path, watcher: Watcher) -> SourceCt:
     if name is not None:
         surfaces = place.volume(name)
     else:
-        found = find(place, Wanted(Space.LPS))
-        if not found.cts and found.problems:
-            raise found.problems[0]
-        if not found.cts:
+        contents = find(place, Wanted(Space.LPS))
+        if not contents.cts and contents.problems:
+            raise contents.problems[0]
+        if not contents.cts:
             refuse("no CT in Hounsfield units", source, ALLOWED, "no_ct")
-        if len(found.cts) > 1:
-            refuse(f"several CTs: {', '.join(one.source for one in found.cts)}", source, ALLOWED, "several_cts")
-        surfaces = found.cts[0].surfaces
+        if len(contents.cts) > 1:
+            refuse(f"several CTs: {', '.join(one.source for one in contents.cts)}", source, ALLOWED, "several_cts")
+        surfaces = contents.cts[0].surfaces
     watcher.step("reading", "skin")
     imaged = surfaces.imaged()
     skin, image = imaged.skin(), imaged.image
@@ -106,10 +106,10 @@ class MarkersRun(Shown):
 
     @property
     def points(self) -> NamedPoints:
-        """Their names and centres, LPS mm (or the case's local frame)."""
-        found = self.seen.fiducials
+        """Names and centres of the markers, LPS mm (or the case's local frame)."""
+        markers = self.seen.fiducials
         space = Space.LOCAL if self.source.space is Space.LOCAL else Space.LPS
-        return NamedPoints(tuple(one.name for one in found), np.array([one.position_ct for one in found]), space)
+        return NamedPoints(tuple(one.name for one in markers), np.array([one.position_ct for one in markers]), space)
 
     @property
     def not_seen(self) -> list[str]:
@@ -136,11 +136,11 @@ class MarkersRun(Shown):
 
     def text(self) -> str:
         """For the terminal."""
-        found = self.summary()
-        rows = found["markers"]
+        document = self.summary()
+        rows = document["markers"]
         head = f"{len(rows)} markers in {self.source.name}, mm {self.source.space}"
         warnings = [f"{one} of the layout is not seen, or has moved" for one in self.not_seen]
-        if doubtful := found["doubtful"]:
+        if doubtful := document["doubtful"]:
             each = [f"{vector(one['position_mm'], 1)} {one['why']}" for one in doubtful]
             warnings.append(f"may be a marker too: {first_few(each)}")
         return text([Section(head, [grid(FIELDS, rows)]), *footer(self.files, warnings)])
@@ -163,7 +163,7 @@ def _row(one: Fiducial, space: Space) -> dict[str, Any]:
 
 
 def distances_mm(points: Sequence[Floats]) -> Floats:
-    """Straight, of each to each, shape (n, n)."""
+    """Straight distances of each to each, mm, shape (n, n)."""
     stacked = np.array(points)
     return np.asarray(np.linalg.norm(stacked[:, None] - stacked, axis=2))
 
@@ -210,7 +210,7 @@ class _Sheet(NamedTuple):
 
 
 def _written(run: Run, sheet: _Sheet, out: Path, csv: str, inputs: tuple[Input, ...], watcher: Watcher) -> Run:
-    """A run with its files; Slicer knows no space of a case's own, and gets no list of it."""
+    """A run with its files written; Slicer knows no space of a case's own, and gets no list of it."""
     from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
 
     names, points, space = sheet.points.names, sheet.points.points, sheet.points.space or Space.LPS

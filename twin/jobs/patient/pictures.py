@@ -22,7 +22,7 @@ from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.budget import budget_facts
-from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run, registration_summary, writing_of
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, SLICES, TRIALS, Run, case_draft, registration_summary
 from puncture_twin.twin.report.error_pictures import budget_figure
 from puncture_twin.twin.report.figures import halo, write_png
 from puncture_twin.twin.report.map.map_picture import draw_map
@@ -57,17 +57,17 @@ def with_pictures(run: Run, out: Path) -> Run:
 
 def draw_pictures(run: Run, out: Path) -> Drawn:
     """Draw the map, the scene and the slices, which show what was searched and planned."""
-    context, found = run.context, run.candidates
+    context, candidates = run.context, run.candidates
     case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
-        raster = map_raster(found, map_view(case, found))
-        draw_map(found, case, out / "map.png", run.pick, raster=raster, scan=anatomy.scan)
+        raster = map_raster(candidates, map_view(case, candidates))
+        draw_map(candidates, case, out / "map.png", run.pick, raster=raster, scan=anatomy.scan)
     with stages.time("scene"):
         base = _checked_base(run)
-        scene = Scene(case, anatomy, found, run.plan, pick=run.pick, T_base_ct=base, refusal=run.refusal)
+        scene = Scene(case, anatomy, candidates, run.plan, pick=run.pick, T_base_ct=base, refusal=run.refusal)
         draw_scene(scene, out / "scene.png")
     with stages.time("slices"):
-        pick = run.pick or found.best
+        pick = run.pick or candidates.best
         subject = None if pick is None else _subject(context, pick, run.plan)
         if subject is not None:
             write_sheet(draw_slices(subject), out / SLICES)
@@ -77,7 +77,7 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
 
 def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
     """The run with its pictures, and with the page of all that is known."""
-    context, found = run.context, run.candidates
+    context, candidates = run.context, run.candidates
     case, anatomy, stages = context.case, context.anatomy, context.stages
     placement, shown = context.placement, None
     if placement is not None and placement.registration is not None:
@@ -88,7 +88,7 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
         page = Shown(
             case,
             anatomy,
-            found,
+            candidates,
             run.plan,
             run.rehearsal,
             shown,
@@ -97,7 +97,7 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
             pick=run.pick,
             subject=drawn.subject,
             T_base_ct=None if run.refusal else _checked_base(run),
-            regions_ct=context.regions_ct(found.arm.q_insertion),
+            regions_ct=context.regions_ct(candidates.arm.q_insertion),
             facts=run.facts,
             refusal=run.refusal,
             raster=drawn.raster,
@@ -109,7 +109,7 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
 
 
 def _checked_base(run: Run) -> Floats | None:
-    """Where the patient is for an arm that was checked; None where it was not."""
+    """T_base_ct of an arm that was checked; None where it was not."""
     placement = run.context.placement
     return placement.T_base_ct if placement is not None and run.candidates.arm_checked else None
 
@@ -129,7 +129,7 @@ def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
 def write_check_picture(context: CaseContext, explained: Explanation, path: Path) -> Path:
     """Write the slices of one explained direction, as an entry of its folder's set; safe or not."""
     _check_png(path)
-    with writing_of(context, path.parent, f"check {path.name}", (path.name,)) as draft:
+    with case_draft(context, path.parent, f"check {path.name}", (path.name,)) as draft:
         write_sheet(draw_slices(_subject(context, Pick(explained.candidates, 0))), draft.folder / path.name)
     return path
 
@@ -143,20 +143,20 @@ def _subject(context: CaseContext, pick: Pick, plan: Plan | None = None) -> Subj
 
 
 def _uncertainty(run: Run) -> Uncertainty | None:
-    """What the page says of chances: of the plan as it is moved, or without one of the best direction."""
-    context, found = run.context, run.candidates
+    """Chances on the page: of the plan as the arm executes it, or without one of the best direction."""
+    context, candidates = run.context, run.candidates
     if context.case.errors is None:
         return None
-    picture = next((path for path in run.files if path.name == ROOMS), None)
-    rooms = None if run.distribution is None else run.distribution.summary()
+    picture = next((path for path in run.files if path.name == TRIALS), None)
+    trials = None if run.distribution is None else run.distribution.summary()
     if run.plan is not None:
         q = run.plan.insertion.q[-1]
-        return Uncertainty(context.breakdown_at(run.plan.outward_ct, q), rooms, picture, _budget(context, q))
-    if not len(found.ranked):
-        return Uncertainty(None, rooms, picture)
-    row = found.ranked[0]
-    breakdown = context.explain(found.theta[row], found.beta[row]).breakdown
-    return Uncertainty(breakdown, rooms, picture, _budget(context, found.arm.q_insertion[row]))
+        return Uncertainty(context.breakdown_at(run.plan.outward_ct, q), trials, picture, _budget(context, q))
+    if not len(candidates.ranked):
+        return Uncertainty(None, trials, picture)
+    row = candidates.ranked[0]
+    breakdown = context.explain(candidates.theta[row], candidates.beta[row]).breakdown
+    return Uncertainty(breakdown, trials, picture, _budget(context, candidates.arm.q_insertion[row]))
 
 
 def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | None:

@@ -1,4 +1,4 @@
-"""The job ``place``: the best position of the arm's base is searched for, written, and printed for a person."""
+"""The job ``place``: the best position of the arm's base searched, written, and as text."""
 
 import time
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from puncture_twin.planning.search.constraints import with_answers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.search import organ_candidates
-from puncture_twin.twin.jobs.patient.run import writing_of
+from puncture_twin.twin.jobs.patient.run import case_draft
 from puncture_twin.twin.report.numbers import direction_text, mounting_text
 from puncture_twin.twin.report.present import Field, Section, Warn, footer, grid, text
 
@@ -32,7 +32,7 @@ class PlaceRun:
     """Result of ``place``, and the files that it wrote."""
 
     context: CaseContext
-    found: place.PlaceSearch
+    search: place.PlaceSearch
     document: dict[str, Any]
     files: tuple[Path, ...]
 
@@ -51,7 +51,7 @@ class _Clock:
         self._last = self._since = (self._began, 0)
 
     def __call__(self, done: int, total: int | None) -> bool:
-        """Not where the next piece of work, as long as the last one, would end too late."""
+        """False where the next piece of work, as long as the last one, would end too late."""
         now = time.perf_counter()
         piece = now - self._last[0] if self._last[1] else 0.0  # what came before the first is no such piece
         self._last = now, done
@@ -82,30 +82,30 @@ def place_case(
     """
     names = ("placements.csv", "place.json", *(("placements.png", "map_best_place.png") if pictures else ()))
     try:
-        with writing_of(context, out, "place", names) as draft:
+        with case_draft(context, out, "place", names) as draft:
             until = np.inf if quick_s is None else quick_s + (time.perf_counter() if began is None else began)
             run = _placed(context, draft.folder, jobs, pictures, until)
     except NoAnswerError:
         withdraw(out, "place")
         raise
-    refuse_none(run.found)
+    refuse_none(run.search)
     return replace(run, files=draft.final(run.files))
 
 
-def refuse_none(found: place.PlaceSearch) -> None:
+def refuse_none(search: place.PlaceSearch) -> None:
     """Refuse a search in which no placement reaches a direction: its best is none."""
-    if not any(one.verdict.reached for one in found.rated):
-        what = f"the arm reaches no organ-safe direction from any placement ({plural(found.checked[0], 'check')})"
-        if not found.complete:
+    if not any(one.verdict.reached for one in search.rated):
+        what = f"the arm reaches no organ-safe direction from any placement ({plural(search.checked[0], 'check')})"
+        if not search.complete:
             what += ", as far as was searched; to search to the end: --full, or quick_s=None in Python"
         raise NoAnswerError(what, code="no_placement")
 
 
 class Places(NamedTuple):
-    """The directions that the organs allow, and where the arm should stand to reach them."""
+    """The directions that the organs allow, and the search for a base that reaches them."""
 
     candidates: Candidates
-    found: place.PlaceSearch
+    search: place.PlaceSearch
 
 
 def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Places:
@@ -122,33 +122,33 @@ def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Place
         candidates = organ_candidates(case, context.anatomy, context.engine, case.directions())
     with stages.time("placements"):
         goes_on, parts = _Clock(context, until), (case, context.anatomy, candidates, context.placement)
-        found = place.search_placements(*parts, jobs=jobs, goes_on=goes_on, first=tell)
-    return Places(candidates, found)
+        search = place.search_placements(*parts, jobs=jobs, goes_on=goes_on, first=tell)
+    return Places(candidates, search)
 
 
 def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: float) -> PlaceRun:
     case, stages = context.case, context.stages
-    candidates, found = find_places(context, jobs, until - PICTURES_S * pictures)
-    document = place.place_document(found, context.provenance() | {"arm": ARM_CHECKED})
-    if not found.complete:
-        whole = sum(one.verdict.count == found.directions for one in found.rated)
+    candidates, search = find_places(context, jobs, until - PICTURES_S * pictures)
+    document = place.place_document(search, context.provenance() | {"arm": ARM_CHECKED})
+    if not search.complete:
+        whole = sum(one.verdict.count == search.directions for one in search.rated)
         ended = (
-            f"the time is over: {whole} of {plural(len(found.rated), 'placement')} were checked in all directions; the "
-            f"fractions of the others are estimates. The search stopped at steps of {found.resolution_mm:.0f} mm. "
+            f"the time is over: {whole} of {plural(len(search.rated), 'placement')} were checked in all directions; "
+            f"the fractions of the others are estimates. The search stopped at steps of {search.resolution_mm:.0f} mm. "
             "Another run may check more or fewer; --full searches to the end"
         )
         document["warnings"] = [*document["warnings"], ended]
-    place.write_placements(found, out / "placements.csv")
+    place.write_placements(search, out / "placements.csv")
     place.write_place_document(document, out / "place.json")
     files = [out / "placements.csv", out / "place.json"]
     if pictures:
         from puncture_twin.twin.report.map.placement_picture import draw_placements  # with matplotlib
 
         with stages.time("pictures"):
-            draw_placements(found, case, context.anatomy.skin.mesh, out / "placements.png")
+            draw_placements(search, case, context.anatomy.skin.mesh, out / "placements.png")
             files.append(out / "placements.png")
-    best = found.rated[0].verdict if found.rated else None
-    if pictures and best is not None and best.reached and best.count == found.directions:
+    best = search.rated[0].verdict if search.rated else None
+    if pictures and best is not None and best.reached and best.count == search.directions:
         from puncture_twin.twin.report.map.map_picture import draw_map
 
         with stages.time("map"):
@@ -156,23 +156,23 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
             shown = replace(case, name=f"{case.name}, arm at the best place")
             draw_map(reached, shown, out / "map_best_place.png", scan=context.anatomy.scan)
             files.append(out / "map_best_place.png")
-    return PlaceRun(context, found, document, tuple(files))
+    return PlaceRun(context, search, document, tuple(files))
 
 
 def place_text(run: PlaceRun) -> str:
     """The ranked placements, the case's own, the lines to paste, and the files."""
-    case, found = run.context.case, run.found
-    x, y, z = (direction_text(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
+    case, search = run.context.case, run.search
+    x, y, z = (direction_text(search.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
     frame = f"from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}"
-    ranked = [(str(rank), one) for rank, one in enumerate(found.rated, start=1)]
-    own = [] if found.own is None else [("-", found.own)]
+    ranked = [(str(rank), one) for rank, one in enumerate(search.rated, start=1)]
+    own = [] if search.own is None else [("-", search.own)]
     best = Warn(tuple(str(run.document["mount_lines"] or "").splitlines()))
     truth = "this is a proposal: measure the real position of the base with markers ([registration])"
     return text([
         Section(
-            f"case {case.name}: {found.directions:,} organ-safe directions; {len(found.coarse):,} + {found.refined:,} "
-            f"placements were estimated; {len(found.rated)} were checked",
-            [frame, *needle_line(found.possible), grid(_fields(run), [*ranked, *own])]),
+            f"case {case.name}: {search.directions:,} organ-safe directions; {len(search.coarse):,} + "
+            f"{search.refined:,} placements were estimated; {len(search.rated)} were checked",
+            [frame, *needle_line(search.possible), grid(_fields(run), [*ranked, *own])]),
         *([Section("the best, for the case (replaces its [registration] or [robot.mount]):", [best]),
            Section(truth, [])] if best.lines else []),
         *footer(run.files, run.document["warnings"], run.context.stages.seconds),
@@ -186,13 +186,13 @@ def _fields(run: PlaceRun) -> list[Field]:
     def mount(ranked: Ranked) -> str:
         one, home = ranked[1], ranked[1].verdict.home_contact
         space = str(run.context.case.space)
-        name = one.name if one.site is None else mounting_text(one.site.region, run.found.T_ct_bed, space)
+        name = one.name if one.site is None else mounting_text(one.site.region, run.search.T_ct_bed, space)
         return name + (f"; home: {home}" if home else "")
 
     return [
         Field("rank", lambda ranked: ranked[0]),
         Field("fraction", lambda ranked: 100 * ranked[1].verdict.fraction, 1, "%"),
-        Field("which is", lambda ranked: "exact" if ranked[1].verdict.count == run.found.directions else "estimated"),
+        Field("which is", lambda ranked: "exact" if ranked[1].verdict.count == run.search.directions else "estimated"),
         Field("reached", lambda ranked: ranked[1].verdict.reached),
         Field("of checked", lambda ranked: ranked[1].verdict.count),
         Field("margin", lambda ranked: ranked[1].verdict.margin, 2),

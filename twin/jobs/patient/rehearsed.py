@@ -1,4 +1,4 @@
-"""A plan executed in one room or in many: what is asked of the simulator, and what is written of its answer."""
+"""Rehearsal of a plan in one trial or many: the stages in the simulator, and the files of their results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from puncture_twin.planning.base.processes import process_pool, worker_count
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.budget.guidance import equipped, sight_of
-from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run, rehearsal_summary
+from puncture_twin.twin.jobs.patient.run import FILM, TRIALS, Run, TrialCount, rehearsal_summary
 from puncture_twin.twin.jobs.terminal import write_json
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.rehearsal.plan_truth import error_rank, median_truth, plan_truth
@@ -49,19 +49,19 @@ def _load_simulator() -> None:
 
 
 def _execute(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsal:
-    """See `rehearse`; PyBullet is loaded where this is called."""
+    """Call `rehearse`; PyBullet is loaded in the process that calls this."""
     from puncture_twin.twin.rehearsal.rehearsal import rehearse
 
     return rehearse(plan, case, anatomy, truth)
 
 
-def rehearse_once(context: CaseContext, plan: Plan, rooms: RoomCount | None, seed: int | None) -> Rehearsal:
-    """A plan executed where the truth differs: the drawn one, or the median one of many rooms."""
-    found = None if rooms is None else in_rooms(context, plan, rooms, seed)
-    truth = plan_truth(context, plan, seed) if found is None else median_truth(found)
+def rehearse_once(context: CaseContext, plan: Plan, trials: TrialCount | None, seed: int | None) -> Rehearsal:
+    """A plan rehearsed by a ground truth: the drawn one, or the median one of many trials."""
+    distribution = None if trials is None else case_distribution(context, plan, trials, seed)
+    truth = plan_truth(context, plan, seed) if distribution is None else median_truth(distribution)
     rehearsal = _execute(plan, context.case, context.anatomy, truth)
-    standing = error_rank(context, plan.insertion.q[-1], found, rehearsal.tip_error_mm)
-    return replace(rehearsal, standing=standing, distribution=found)
+    rank = error_rank(context, plan.insertion.q[-1], distribution, rehearsal.tip_error_mm)
+    return replace(rehearsal, standing=rank, distribution=distribution)
 
 
 def _film(rehearsal: Rehearsal, plan: Plan, case: Case, anatomy: Anatomy, path: Path) -> Path:
@@ -79,62 +79,62 @@ class PendingRehearsal:
     rehearsal: Wait
 
     def ended(self, out: Path, with_page: Callable[[Run], Run] | None = None) -> Run:
-        """The run with what was measured and the film, once they are there; the numbers and the rooms are written.
+        """The run with its rehearsal and film, once they are there; the numbers and the trials are written.
 
         `with_page` adds the page that shows them all to a run; while the film is made, which has the usual name but
         where no encoder can be started.
         """
-        from puncture_twin.twin.report.error_pictures import draw_rooms_picture
+        from puncture_twin.twin.report.error_pictures import draw_distribution
 
-        run, time, many = self.run, self.run.context.stages.time, self.run.distribution
+        run, time, trials = self.run, self.run.context.stages.time, self.run.distribution
         assert run.plan is not None
-        if many is not None:
+        if trials is not None:
             with time("rooms.png"):
-                draw_rooms_picture(many, out / ROOMS)
+                draw_distribution(trials, out / TRIALS)
         with time("rehearsal"):
             rehearsal: Rehearsal = self.rehearsal()
-        standing = error_rank(run.context, run.plan.insertion.q[-1], many, rehearsal.tip_error_mm)
-        rehearsal = replace(rehearsal, standing=standing)
+        rank = error_rank(run.context, run.plan.insertion.q[-1], trials, rehearsal.tip_error_mm)
+        rehearsal = replace(rehearsal, standing=rank)
         film_at = self.begin(_film, rehearsal, run.plan, run.context.case, run.context.anatomy, out / FILM)
-        shown, rooms = ({}, ()) if many is None else ({"distribution": many.summary()}, (out / ROOMS,))
+        shown, picture = ({}, ()) if trials is None else ({"distribution": trials.summary()}, (out / TRIALS,))
         document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
         measured = replace(run, rehearsal=rehearsal).with_files(write_json(document, out / "rehearsal.json"))
-        run = measured.with_files(out / FILM, *rooms)
+        run = measured.with_files(out / FILM, *picture)
         run = run if with_page is None else with_page(run)
         with time("film"):
             film: Path = film_at()
         if film == out / FILM:
             return run
-        run = measured.with_files(film, *rooms)
+        run = measured.with_files(film, *picture)
         return run if with_page is None else with_page(run)
 
 
-def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingRehearsal:
-    """Have the run's plan executed where the truth differs, of many rooms in the median one."""
+def begin_rehearsal(run: Run, trials: TrialCount | None, begin: Begin) -> PendingRehearsal:
+    """Begin to rehearse the run's plan by a ground truth, the median one of many trials."""
     assert run.plan is not None
     context, plan = run.context, run.plan
-    run = run if rooms is None else replace(run, distribution=in_rooms(context, plan, rooms))
-    found = run.distribution
-    truth = plan_truth(context, plan) if found is None else median_truth(found)
+    run = run if trials is None else replace(run, distribution=case_distribution(context, plan, trials))
+    distribution = run.distribution
+    truth = plan_truth(context, plan) if distribution is None else median_truth(distribution)
     return PendingRehearsal(run, begin, begin(_execute, plan, context.case, context.anatomy, truth))
 
 
-def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | None = None) -> Distribution:
-    """A plan's tip errors over many rooms, each with a truth of its own; the case's seed by default."""
+def case_distribution(context: CaseContext, plan: Plan, trials: TrialCount, seed: int | None = None) -> Distribution:
+    """A plan's tip errors over many trials, each with a ground truth of its own; the case's seed by default."""
     seed = context.case.rehearsal.seed if seed is None else seed
     with context.stages.time("rooms"):
         q = plan.insertion.q[-1]
-        sight = None
-        if (way := count.guidance) is not None:
-            sight = sight_of(replace(context, case=equipped(context.case, way)[0]), plan, way)
-        found = rehearse_trials(context, plan.outward_ct, q, count.rooms, seed, count.guidance, sight, count.steps)
-    if found.stepwise is not None:
+        sight, (count, _, guidance, steps) = None, trials
+        if guidance is not None:
+            sight = sight_of(replace(context, case=equipped(context.case, guidance)[0]), plan, guidance)
+        distribution = rehearse_trials(context, plan.outward_ct, q, count, seed, guidance, sight, steps)
+    if distribution.stepwise is not None:
         moving_s = plan.approach.duration_s + plan.insertion.duration_s
-        found = replace(found, stepwise=found.stepwise._replace(moving_s=moving_s))
-    if not (count.physics and len(found)):
-        return found
+        distribution = replace(distribution, stepwise=distribution.stepwise._replace(moving_s=moving_s))
+    if not (trials.physics and len(distribution)):
+        return distribution
     from puncture_twin.twin.rehearsal.plan_truth import physics_trials
 
     with context.stages.time("physics"):
         again = partial(context.watcher.count, "trials in the simulator")
-        return replace(found, physics=physics_trials(context, plan, found, count.physics, again))
+        return replace(distribution, physics=physics_trials(context, plan, distribution, trials.physics, again))

@@ -1,4 +1,4 @@
-"""What a command about a patient has done so far, as plain values (mm, degrees) and as text, and its files."""
+"""State of a command about a patient, as plain values (mm, degrees) and as text, and its files."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ if TYPE_CHECKING:
 
 PAGE, SLICES = "report.html", "slices.png"
 PICTURES = ("map.png", "scene.png", SLICES, PAGE)  # what a search writes; slices only where there is a direction
-FILM, ROOMS = "rehearsal.mp4", "rooms.png"
+FILM, TRIALS = "rehearsal.mp4", "rooms.png"
 NOTABLE = 0.05  # of an expected error: by as much two configurations' differ before people are told
 SAME_AIM = 0.02  # rad: joints that differ by less are of one insertion, an arm's errors alike to a fiftieth
 
 
-def writing_of(
+def case_draft(
     context: CaseContext,
     out: Path,
     command: str,
@@ -59,33 +59,33 @@ def writing_of(
     return writing(out, command, inputs=inputs, seconds=seconds, names=names, made_from=made_from, note=note)
 
 
-class RoomCount(NamedTuple):
-    """How many rooms are rehearsed, how many in the simulator too, the way of guidance if any, and its steps."""
+class TrialCount(NamedTuple):
+    """Number of trials, how many of them in the simulator too, the guidance if any, and its steps."""
 
-    rooms: int
+    trials: int
     physics: int = 0
     guidance: str | None = None
     steps: int | None = None
 
 
-def room_count(
-    rooms: int | None, physics: int, guidance: str | None = None, steps: int | None = None
-) -> RoomCount | None:
-    """How many rooms are wanted; None for none beside the one that is executed."""
+def trial_count(
+    trials: int | None, physics: int, guidance: str | None = None, steps: int | None = None
+) -> TrialCount | None:
+    """The trials that are wanted; None for none besides the one that is executed."""
     stepped(guidance, steps)
     if guidance is not None:
         check_way(guidance)
-        if rooms is None or physics:
+        if trials is None or physics:
             what = "--guidance leads the needle in trials without physics"
             refuse(what, "--guidance", "--guidance WAY --seeds N, without --physics", "conflicting_options")
-    if physics > (rooms or 0):
+    if physics > (trials or 0):
         refuse("--physics runs some of the trials", "--physics", "--seeds N --physics K, K <= N", "conflicting_options")
-    return None if rooms is None else RoomCount(rooms, physics, guidance, steps)
+    return None if trials is None else TrialCount(trials, physics, guidance, steps)
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a command has done so far, and its files; `refusal` says why there is no plan although it makes one."""
+    """State and files of a command; `refusal` says why there is no plan although it makes one."""
 
     context: CaseContext
     candidates: Candidates
@@ -112,41 +112,41 @@ class Run:
         pick = self.pick or self.candidates.best
         if pick is None:
             return None
-        found, row = pick
-        return self.context.entry_facts(found.path.entry_ct[row], found.outward_ct[row])
+        searched, row = pick
+        return self.context.entry_facts(searched.path.entry_ct[row], searched.outward_ct[row])
 
     @property
     def failures(self) -> tuple[str, ...]:
         """How the rehearsed needle missed or touched, and where more trials did than the case allows; "" for none."""
         if self.rehearsal is None:
             return ()
-        of_many = () if self.distribution is None else trial_failures(self.context.case, self.distribution)
-        return (*rehearsal_failures(self.context, self.rehearsal), *of_many)
+        failed = () if self.distribution is None else trial_failures(self.context.case, self.distribution)
+        return (*rehearsal_failures(self.context, self.rehearsal), *failed)
 
     def with_files(self, *files: Path) -> Run:
-        """The run with files more."""
+        """The run with more files."""
         return replace(self, files=(*self.files, *files))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
-        found, provenance = self.candidates, self.context.provenance()
-        found_windows = found.windows
-        windows, largest = found_windows.windows, found_windows.largest
+        candidates, provenance = self.candidates, self.context.provenance()
+        all_windows = candidates.windows
+        windows, largest = all_windows.windows, all_windows.largest
         at_patient = {} if self.facts is None else self.facts.summary()
         return {
             **provenance,
-            "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
-            "findings": [*provenance["findings"], *(one.document() for one in found.findings)],
+            "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, candidates)],
+            "findings": [*provenance["findings"], *(one.document() for one in candidates.findings)],
             "inputs": inputs_document(self.inputs),
-            "headline": found_windows.headline,
-            "largest_window": None if largest is None else window_summary(found, largest),
+            "headline": all_windows.headline,
+            "largest_window": None if largest is None else window_summary(candidates, largest),
             "looked": sides_text(self.context.sides, searched=True),
             "sides": [side.document() for side in self.context.sides],
-            "directions": len(found),
-            "counts": found.counts(),
-            "best": [window_summary(found, window) for window in windows[:MOST_WINDOWS]],
+            "directions": len(candidates),
+            "counts": candidates.counts(),
+            "best": [window_summary(candidates, window) for window in windows[:MOST_WINDOWS]],
             "windows": len(windows),
-            "safe_cone_from": found.cone_source,
+            "safe_cone_from": candidates.cone_source,
             "plan": None if self.plan is None else plan_summary(self.plan) | at_patient,
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
             **({} if self.rehearsal is None else {"failures": list(self.failures)}),
@@ -159,16 +159,16 @@ class Run:
 
     @property
     def plan_notes(self) -> tuple[str, ...]:
-        """What else must be known of the plan's expected error and of its aim."""
+        """Notes on the plan's expected error and its aim."""
         plan, chances = self.plan, self.candidates.chances
         if plan is None:
             return ()
         notes = [] if self.context.case.bending is None else ["The expected error assumes a straight needle."]
         if self.context.chance is None:
             notes.append("The expected error counts the markers alone: [errors] does not declare the arm's errors.")
-        same = (self.candidates.theta == plan.theta) & (self.candidates.beta == plan.beta)
-        if chances is not None and same.any():  # its row may be of another configuration
-            other = float(np.hypot(chances.lateral_mm[same][0], chances.depth_mm[same][0]))
+        matches = (self.candidates.theta == plan.theta) & (self.candidates.beta == plan.beta)
+        if chances is not None and matches.any():  # its row may be of another configuration
+            other = float(np.hypot(chances.lateral_mm[matches][0], chances.depth_mm[matches][0]))
             if abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
                 configuration = f"In the configuration of the table and of check: {other:.2f} mm."
                 notes.append(f"{configuration} The approach may end in another.")
@@ -190,19 +190,19 @@ class Run:
         return text([*first, *self._searched(), *self._done(), *notes, *ending])
 
     def _searched(self) -> list[Section]:
-        found, sides = self.candidates, self.context.sides
+        candidates, sides = self.candidates, self.context.sides
         looked = f", entry sides: {sides_text(sides, searched=True)}" if sides else ""
-        warned = (*needle_warnings(self.context.case, found), *(one.sentence for one in found.findings))
-        if found.safe.any():
-            best = Section("the best of each window", patient.windows(found, self.context.anatomy.scan))
-        elif (row := closest_miss(found)) is None:
+        warned = (*needle_warnings(self.context.case, candidates), *(one.sentence for one in candidates.findings))
+        if candidates.safe.any():
+            best = Section("the best of each window", patient.windows(candidates, self.context.anatomy.scan))
+        elif (row := closest_miss(candidates)) is None:
             best = Section("no candidate is safe", [])
         else:
-            angles = "theta {theta_deg:g} deg, beta {beta_deg:g} deg".format(**found.at(row))
-            best = Section(f"no candidate is safe; the closest, {angles}: {reason_text(found, row)}", [])
+            angles = "theta {theta_deg:g} deg, beta {beta_deg:g} deg".format(**candidates.at(row))
+            best = Section(f"no candidate is safe; the closest, {angles}: {reason_text(candidates, row)}", [])
         return [
-            Section(f"case {self.context.case.name}: {found.windows.headline}", []),
-            Section(f"{plural(len(found), 'direction')}{looked}", patient.counts(found)),
+            Section(f"case {self.context.case.name}: {candidates.windows.headline}", []),
+            Section(f"{plural(len(candidates), 'direction')}{looked}", patient.counts(candidates)),
             *(Section(one, []) for one in warned),
             best,
         ]
@@ -217,7 +217,7 @@ class Run:
         if self.rehearsal is not None:
             done.append(Section("rehearsal", patient.rehearsal(self.rehearsal, away, failures=self.failures)))
         if self.distribution is not None:
-            done.append(Section("many trials", patient.rooms(self.distribution.summary())))
+            done.append(Section("many trials", patient.trials(self.distribution.summary())))
         if self.certificate is not None:
             done.append(Section("certificate", patient.certificate(self.certificate.summary())))
         if (checked := self.checked) is not None:
@@ -227,7 +227,7 @@ class Run:
         return done
 
 
-def plain_of(one: Any, *names: str) -> dict[str, Any]:
+def plain_fields(one: Any, *names: str) -> dict[str, Any]:
     """Some of a record's fields as JSON has them."""
     return {name: plain(getattr(one, name)) for name in names}
 
@@ -250,15 +250,15 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
     if distortion is not None:
         distorted = {**vars(distortion), "doubted": distortion.significant, "text": distortion.finding().sentence}
     return {
-        **plain_of(registration, "method", "T_base_ct"),
+        **plain_fields(registration, "method", "T_base_ct"),
         "residual_mm": dict(zip(registration.markers.names, registration.residual_mm.tolist(), strict=True)),
-        **plain_of(registration, "fre_mm", "mean_error_mm", "fle_mm", "fle_source"),
+        **plain_fields(registration, "fre_mm", "mean_error_mm", "fle_mm", "fle_source"),
         "fle_interval_mm": list(registration.fle_interval_mm),
         "chi_squared": finite(test.chi_squared),
         "degrees_of_freedom": test.freedom,
         "noise_scale": test.scale,
         **declared,
-        **plain_of(registration.conditioning, "spread_ratio", "altitude_mm", "leverage"),
+        **plain_fields(registration.conditioning, "spread_ratio", "altitude_mm", "leverage"),
         "distortion": distorted,
         "flags": [flag.sentence for flag in registration.flags],
         "findings": [flag.document() for flag in registration.flags],
@@ -307,10 +307,10 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
     """A rehearsal's main numbers as plain values; the needle's end in LPS, or the case's local frame."""
     forward = np.linalg.inv(rehearsal.T_base_ct_true)[:3, :3] @ rehearsal.T_base_flange_true[-1, :3, 2]
     return {
-        **plain_of(rehearsal, "seed", "tip_error_mm", "lateral_mm", "depth_mm", "predicted_error_mm"),
+        **plain_fields(rehearsal, "seed", "tip_error_mm", "lateral_mm", "depth_mm", "predicted_error_mm"),
         "contacts": [f"{c.link} touches {c.body} at {c.time_s:.2f} s" for c in rehearsal.contacts],
         "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
-        **plain_of(rehearsal, "control", "off_path_mm"),
+        **plain_fields(rehearsal, "control", "off_path_mm"),
         "tissue_n": None if rehearsal.tissue_force is None else rehearsal.tissue_force._asdict(),
         "needle_end": {
             "tip_ct_mm": rehearsal.tip_true_ct[-1].tolist(),
@@ -324,7 +324,7 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
 
 
 def rehearsal_failures(context: CaseContext, rehearsal: Rehearsal) -> tuple[str, ...]:
-    """How the needle of one room missed its target, and what it or the arm touched, one sentence each."""
+    """How the needle of one trial missed its target, and what it or the arm touched, one sentence each."""
     avoided = (one.name for one in context.anatomy.checked if one.demands_margin)
     touched = [name for name in avoided if np.min(rehearsal.clearance_mm.get(name, np.inf)) < 0.0]
     case, tip_ct = context.case, rehearsal.tip_true_ct[-1:]
@@ -339,14 +339,14 @@ def rehearsal_failures(context: CaseContext, rehearsal: Rehearsal) -> tuple[str,
     )
 
 
-def trial_failures(case: Case, found: Distribution) -> Iterator[str]:
-    """Where more of many rooms missed or touched than the case's limits of the chances allow, one sentence each."""
-    if not len(found):
+def trial_failures(case: Case, distribution: Distribution) -> Iterator[str]:
+    """Where more trials missed or touched than the case's limits of the chances allow, one sentence each."""
+    if not len(distribution):
         yield "in no trial did the needle reach the target"
         return
-    least, hit, touched = case.search.min_hit or 0.0, found.hit_share or 0.0, found.touched.mean(axis=0)
+    least, hit, touched = case.search.min_hit or 0.0, distribution.hit_share or 0.0, distribution.touched.mean(axis=0)
     if hit < least:
         yield f"{100 * hit:.2f} % of the trials hit the target; search.min_hit demands {100 * least:.2f} %"
-    for name, share in zip(found.structures, touched.tolist(), strict=True):
-        if share > (most := touch_limit(case, name)):
-            yield f"{100 * share:.2f} % of the trials touched {name}; the case allows {100 * most:.2f} %"
+    for name, fraction in zip(distribution.structures, touched.tolist(), strict=True):
+        if fraction > (most := touch_limit(case, name)):
+            yield f"{100 * fraction:.2f} % of the trials touched {name}; the case allows {100 * most:.2f} %"

@@ -1,4 +1,4 @@
-"""What a person looks at: B-mode pictures with what was detected, and both arms about the phantom."""
+"""Pictures of a self-calibration: B-mode pictures with what was detected, and both arms about the phantom."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -45,7 +45,7 @@ class Panel(NamedTuple):
     picture: Pixels
     title: str
     text: str
-    found: Detection | None
+    detection: Detection | None
     true: NeedleInImage
     target: Floats | None = None
 
@@ -56,12 +56,12 @@ def detection_sheet(case: SelfcalCase, trial: SelfcalTrial, path: Path) -> Path:
     panels = [*_recorded_panels(trial), *_puncture_panels(case, trial, rng)]
     imager = case.content.image.imager()
     width, height = (PX_PER_MM * (side + imager.pixel_mm) for side in imager.size_mm)
-    wide, rows = width + 2 * MARGIN, -(-len(panels) // COLUMNS)
+    sheet_width, rows = width + 2 * MARGIN, -(-len(panels) // COLUMNS)
     high = height + CAPTION + 2 * MARGIN
-    size = (round(COLUMNS * wide), round(rows * high + LEGEND))
+    size = (round(COLUMNS * sheet_width), round(rows * high + LEGEND))
     figure = figure_of(*size)
     for i, panel in enumerate(panels):
-        left, top = (i % COLUMNS) * wide + MARGIN, (i // COLUMNS) * high + MARGIN
+        left, top = (i % COLUMNS) * sheet_width + MARGIN, (i // COLUMNS) * high + MARGIN
         at = (left / size[0], 1 - (top + height) / size[1], width / size[0], height / size[1])
         _draw_panel(figure.add_axes(at), panel, imager)
     marks = (
@@ -104,13 +104,13 @@ def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Gene
 
 def _draw_panel(axes: Axes, panel: Panel, imager: Imager) -> None:
     """The picture in mm, its marks (what lies beyond it is cut off), its scale, and its title and text below."""
-    (wide, deep), half = imager.size_mm, 0.5 * imager.pixel_mm
+    (width, depth), half = imager.size_mm, 0.5 * imager.pixel_mm
     axes.set_axis_off()
-    extent = (-half, wide + half, deep + half, -half)
+    extent = (-half, width + half, depth + half, -half)
     axes.imshow(panel.picture, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bicubic", aspect="auto")
     axes.set_autoscale_on(False)
-    if panel.found is not None:
-        tip, direction = panel.found.tip_image, panel.found.direction_image
+    if panel.detection is not None:
+        tip, direction = panel.detection.tip_image, panel.detection.direction_image
         for side in (-1.2, 1.2):  # beside the shaft, so that it stays visible
             start = tip + side * np.array([-direction[1], direction[0]])
             axes.plot(*np.stack([start, start - MARKED_MM * direction]).T, color=css(DETECTED), linewidth=1)
@@ -119,8 +119,8 @@ def _draw_panel(axes: Axes, panel: Panel, imager: Imager) -> None:
     if panel.target is not None:
         u, v = panel.target[:2].tolist()
         axes.add_patch(Circle((u, v), TARGET_MM, fill=False, color=css(TARGET), linewidth=2))
-    axes.plot((1.0, 11.0), (deep - 1.5, deep - 1.5), color="white", linewidth=3)
-    axes.text(12.0, deep - 1.5, "10 mm", color="white", fontsize=13, va="center")
+    axes.plot((1.0, 11.0), (depth - 1.5, depth - 1.5), color="white", linewidth=3)
+    axes.text(12.0, depth - 1.5, "10 mm", color="white", fontsize=13, va="center")
     for text, below, look in ((panel.title, 6, {"fontsize": 18, "weight": "bold"}), (panel.text, 30, {"fontsize": 15})):
         axes.annotate(text, (0, 0), (0, -below), "axes fraction", textcoords="offset points", va="top", **look)
 

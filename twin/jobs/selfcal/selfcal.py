@@ -40,7 +40,7 @@ SET_ASIDE = "#d6001e"
 
 @dataclass(frozen=True, eq=False)
 class SelfcalRun:
-    """What the command did."""
+    """A self-calibration and its results."""
 
     name: str
     calibration: Calibration
@@ -57,12 +57,12 @@ class SelfcalRun:
 
     @property
     def punctures(self) -> tuple[selfcal_trial.Puncture, ...]:
-        """Of all seeds."""
+        """The punctures of all seeds."""
         return tuple(one for trial in self.trials for one in trial.punctures)
 
 
 def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
-    """Draw ``seeds`` rooms from the case's seed on; record, calibrate and puncture in each.
+    """Draw ``seeds`` ground truths from the case's seed on; record, calibrate and puncture in each.
 
     Raises Degenerate: The poses cannot show every unknown. NoAnswerError: Too few can be taken or show the needle.
     """
@@ -75,9 +75,9 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
     first = trials[0]
     with stages.time("comparison with random choice"):
         choice = compare_choice(case, candidates, first.acquisition)
-    name, found, recording = case.content.name, first.calibration, first.acquisition.recording
+    name, fit, recording = case.content.name, first.calibration, first.acquisition.recording
     return SelfcalRun(
-        name, found, recording, case.inputs, trials, case, candidates, choice, stages, warnings=found.warnings()
+        name, fit, recording, case.inputs, trials, case, candidates, choice, stages, warnings=fit.warnings()
     )
 
 
@@ -94,7 +94,7 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
         recording, inputs, warnings = recording_file.open_recording(path, case)
     with stages.time("calibrate"):
         calibration = recording_file.checked_calibration(recording, case, file, hold=shots is None)
-    tried: tuple[Shot, ...] = ()
+    applied: tuple[Shot, ...] = ()
     if shots is not None:
         with stages.time("shots"):
             following = ShotByShot.of(calibration)
@@ -102,7 +102,7 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
             for row in range(len(more)):
                 following = following.with_shot(more.subset(slice(row, row + 1)))
             calibration = following.calibration(needle_length_mm=recording_file.held_length_mm(case))
-        tried, inputs, warnings = following.shots, (*inputs, *files), (*warnings, *notes)
+        applied, inputs, warnings = following.shots, (*inputs, *files), (*warnings, *notes)
     inputs = (*inputs, *(() if case is None else case.inputs))
     warnings = (*warnings, *calibration.warnings())
     if len(recording.missed) > len(recording):
@@ -110,7 +110,7 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
     if case is not None and calibration.arms is None:
         warnings += (NO_JOINTS.format(file=file.name),)
     return SelfcalRun(
-        file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings, shots=tried
+        file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings, shots=applied
     )
 
 
@@ -120,43 +120,43 @@ def compare_choice(case: SelfcalCase, candidates: pose_choice.CandidatePoses, ta
     rng = np.random.default_rng(case.content.seed)
     sets = [np.array(rows), *(rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS))]
     known = choice_noise(case), pose_choice.drawing(case), poses, case.declared_arms
-    chosen, *drawn = (pose_choice.expected_tre_mm(poses.subset(some), *known) for some in sets)
+    chosen, *random = (pose_choice.expected_tre_mm(poses.subset(some), *known) for some in sets)
     return {
         "chosen_bound_mm": chosen,
-        "random_bound_median_mm": float(np.median(drawn)),
-        "random_bound_best_mm": min(drawn),
-        "random_sets": len(drawn),
+        "random_bound_median_mm": float(np.median(random)),
+        "random_bound_best_mm": min(random),
+        "random_sets": len(random),
     }
 
 
-def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:
+def calibration_summary(calibration: Calibration, recording: Recording) -> dict[str, Any]:
     """A calibration's main values, mm and degrees: with the stated noise, or the estimated spread; arms if declared."""
     names, arms = {"inside_mm": "inside_image_mm", "across_mm": "across_image_mm"}, None
-    noise = {names.get(key, key): value for key, value in found.noise._asdict().items()}
-    if found.arms is not None:
+    noise = {names.get(key, key): value for key, value in calibration.noise._asdict().items()}
+    if calibration.arms is not None:
         arms = {
-            "found_sd": found.arm_errors.tolist(),
-            "chi2_per_freedom": found.chi_squared_ratio,
-            "chi2_chance": found.chi_squared_chance(),
+            "found_sd": calibration.arm_errors.tolist(),
+            "chi2_per_freedom": calibration.chi_squared_ratio,
+            "chi2_chance": calibration.chi_squared_chance(),
         }
     return {
-        "T_end1_image": found.X.tolist(),
-        "T_base1_base2": found.Y.tolist(),
-        "tip_end2_mm": found.tip_end2.tolist(),
-        "needle_direction_end2": found.needle_direction_end2.tolist(),
-        "scale_mm": found.scale.tolist() if recording.pixels else None,
+        "T_end1_image": calibration.X.tolist(),
+        "T_base1_base2": calibration.Y.tolist(),
+        "tip_end2_mm": calibration.tip_end2.tolist(),
+        "needle_direction_end2": calibration.needle_direction_end2.tolist(),
+        "scale_mm": calibration.scale.tolist() if recording.pixels else None,
         "poses": len(recording),
-        "residual_rms_mm": found.rms_mm,
-        "set_aside": list(found.outliers),
+        "residual_rms_mm": calibration.rms_mm,
+        "set_aside": list(calibration.outliers),
         "without_needle": dict(recording.missed),
-        "findings": [one.document() for one in found.findings],
-        "iterations": found.iterations,
-        "condition": found.condition,
+        "findings": [one.document() for one in calibration.findings],
+        "iterations": calibration.iterations,
+        "condition": calibration.condition,
         "noise": in_degrees(noise),
-        "predicted_tre_mm": pose_choice.predicted_tre(found, recording),
-        "tip_bias_mm": found.tip_bias_mm,
+        "predicted_tre_mm": pose_choice.predicted_tre(calibration, recording),
+        "tip_bias_mm": calibration.tip_bias_mm,
         "arms": arms,
-        "cannot_show": list(found.cannot_show),
+        "cannot_show": list(calibration.cannot_show),
     }
 
 
@@ -214,7 +214,7 @@ def run_selfcal(
     case = None if case_path is None else load_selfcal_case(case_path)
     names = ANSWERS if recording is not None else (*ANSWERS, *PICTURES, recording_file.FILE_NAME)
     try:
-        with new_folder(record) as kept, writing(out, "selfcal", names=names, note=watcher.note) as draft:
+        with new_folder(record) as record_folder, writing(out, "selfcal", names=names, note=watcher.note) as draft:
             if recording is not None:
                 run = selfcal_recording(recording, case, shots)
                 draft.keep(recording_file.FILE_NAME)  # one that an earlier run wrote into the folder may be this one
@@ -229,8 +229,8 @@ def run_selfcal(
                     shot, (sheet, room) = run.trials[0].acquisition.shots[0], PICTURES
                     files.append(detection_sheet(case, run.trials[0], draft.folder / sheet))
                     files.append(workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / room))
-                if kept is not None:
-                    keep_pictures(run.trials[0].acquisition, case.content.image.pixel_mm, kept)
+                if record_folder is not None:
+                    keep_pictures(run.trials[0].acquisition, case.content.image.pixel_mm, record_folder)
             files.append(write_page(run, files[2:], draft.folder / ANSWERS[1]))
             draft.inputs, draft.seconds = run.inputs, run.stages.seconds
     except PlanningError:
@@ -240,24 +240,24 @@ def run_selfcal(
 
 
 def calibration_file(run: SelfcalRun) -> dict[str, Any]:
-    """What ``calibration.json`` holds."""
-    found = run.calibration
+    """Content of ``calibration.json``."""
+    calibration = run.calibration
     return {
         "version": VERSION,
         "name": run.name,
         "seed": run.trials[0].seed if run.trials else None,
         "inputs": inputs_document(run.inputs),
-        **calibration_summary(found, run.recording),
-        "residuals_mm": dict(zip(run.recording.names, found.residuals.tolist(), strict=True)),
-        "parameters": list(found.parameters),
-        "covariance": found.covariance_counts.tolist(),
-        "region_limit_95": found.region_limit(),
+        **calibration_summary(calibration, run.recording),
+        "residuals_mm": dict(zip(run.recording.names, calibration.residuals.tolist(), strict=True)),
+        "parameters": list(calibration.parameters),
+        "covariance": calibration.covariance_counts.tolist(),
+        "region_limit_95": calibration.region_limit(),
         "shots": [shot._asdict() for shot in run.shots],
     }
 
 
 def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
-    """Poses, calibration, trials, punctures, and what was written."""
+    """Facts of a self-calibration: poses, calibration, trials, punctures, and files."""
     return {
         **calibration_summary(run.calibration, run.recording),
         "name": run.name,
@@ -273,16 +273,16 @@ def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
     }
 
 
-def selfcal_text(found: Facts) -> str:
+def selfcal_text(facts: Facts) -> str:
     """The sections for a terminal, then the files."""
-    notes = tuple(f"note: {one['sentence']}" for one in found["findings"] if one["severity"] == "note")
-    head = Section(f"{'case' if found['trials'] else 'recording'} {found['name']}", [Warn(notes)] if notes else [])
-    return present.text([head, *sections(found), *present.footer(found["files"], found["warnings"], found["seconds"])])
+    notes = tuple(f"note: {one['sentence']}" for one in facts["findings"] if one["severity"] == "note")
+    head = Section(f"{'case' if facts['trials'] else 'recording'} {facts['name']}", [Warn(notes)] if notes else [])
+    return present.text([head, *sections(facts), *present.footer(facts["files"], facts["warnings"], facts["seconds"])])
 
 
 def write_page(run: SelfcalRun, pictures: Sequence[Path], path: Path) -> Path:
     """Write the page, with the sheet of pictures and the workcell where the twin drew them."""
-    found, seed = selfcal_facts(run), run.trials[0].seed if run.trials else None
+    facts, seed = selfcal_facts(run), run.trials[0].seed if run.trials else None
     residuals = present.picture(residual_picture(run.calibration, run.recording), "Residual of each pose, and v over u")
     X, Y = _matrix(run.calibration.X), _matrix(run.calibration.Y)
     matrices = present.facts([("T_end1_image (X), mm", X), ("T_base1_base2 (Y), mm", Y)])
@@ -290,7 +290,7 @@ def write_page(run: SelfcalRun, pictures: Sequence[Path], path: Path) -> Path:
     deviations = in_degrees(dict(zip(run.calibration.parameters, sigma, strict=True)))
     known = Table(("parameter", "sd"), tuple((name, f"{value:.4f}") for name, value in deviations.items()))
     uncertainty = Section("uncertainty of each parameter", [matrices, known, PARAMETERS])
-    shown = [*sections(found)]
+    shown = [*sections(facts)]
     shown[2:2] = [uncertainty, Section("residuals", [RESIDUALS, residuals])]
     if pictures:
         if run.punctures:
@@ -303,29 +303,29 @@ def write_page(run: SelfcalRun, pictures: Sequence[Path], path: Path) -> Path:
             Section("the workcell", [present.picture(pictures[1], "Both arms about the phantom"), words]),
         ]
     title, origin = f"{run.name}: ultrasound self-calibration", present.origin_section(seed)
-    return present.write_page(path, title, EQUATION, _cards(found), shown, run.inputs, origin=origin)
+    return present.write_page(path, title, EQUATION, _cards(facts), shown, run.inputs, origin=origin)
 
 
-def sections(found: Facts) -> list[Section]:
-    """What the terminal and the page both show."""
-    arms, known = found["arms"], [(NOISE_TEXT[key], number(value, 3)) for key, value in found["noise"].items()]
+def sections(facts: Facts) -> list[Section]:
+    """Sections of a self-calibration, for terminal and page."""
+    arms, known = facts["arms"], [(NOISE_TEXT[key], number(value, 3)) for key, value in facts["noise"].items()]
     if arms is not None:
         known.insert(0, ("χ² of the residuals per degree of freedom", number(arms["chi2_per_freedom"], 2)))
     shown = [
-        Section("what the data cannot determine", [Warn(tuple(found["cannot_show"]))]),
-        Section("calibration", [present.facts([*CALIBRATION, *known], found)]),
+        Section("what the data cannot determine", [Warn(tuple(facts["cannot_show"]))]),
+        Section("calibration", [present.facts([*CALIBRATION, *known], facts)]),
     ]
-    if found["shots"]:
+    if facts["shots"]:
         words = "Each updated the calibration where it fits; residuals above are those of the recording."
-        shown.append(Section("shots after the recording", [words, grid(SHOT, found["shots"])]))
-    if found["trials"]:
+        shown.append(Section("shots after the recording", [words, grid(SHOT, facts["shots"])]))
+    if facts["trials"]:
         reached: list[Block] = ["No target could be reached without contact."]
-        if found["punctures"] is not None:
-            reached = [PUNCTURED, present.facts(PUNCTURES, found["punctures"])]
+        if facts["punctures"] is not None:
+            reached = [PUNCTURED, present.facts(PUNCTURES, facts["punctures"])]
         shown += [
             Section("insertions to targets in the image", reached),
-            Section("seeds, each its own trial", [grid(TRIAL, found["trials"]), HELD_OUT]),
-            Section("poses", _poses(found)),
+            Section("seeds, each its own trial", [grid(TRIAL, facts["trials"]), HELD_OUT]),
+            Section("poses", _poses(facts)),
         ]
     return shown
 
@@ -383,21 +383,21 @@ def _named(some: Facts) -> str:
     return f"{len(some)}: {', '.join(some)}" if some else "none"
 
 
-def counted(found: Facts) -> str:
-    """What the expected error holds."""
-    return "noise alone" if found["arms"] is None else "noise and declared errors of the arms"
+def counted(facts: Facts) -> str:
+    """Text of what the expected error counts."""
+    return "noise alone" if facts["arms"] is None else "noise and declared errors of the arms"
 
 
-def _poses(found: Facts) -> list[Block]:
-    choice, recorded = found["choice"], found["poses"]
-    counts = [(REASON_TEXT[key], f"{value:,}") for key, value in found["candidates"].items() if value]
+def _poses(facts: Facts) -> list[Block]:
+    choice, recorded = facts["choice"], facts["poses"]
+    counts = [(REASON_TEXT[key], f"{value:,}") for key, value in facts["candidates"].items() if value]
     bounds = (
         Field(f"expected error with the {recorded} recorded poses", "chosen_bound_mm", 3, "mm"),
         Field(f"{recorded} at random, median of {choice['random_sets']} choices", "random_bound_median_mm", 3, "mm"),
         Field("at random, the best of them", "random_bound_best_mm", 3, "mm"),
     )
-    drawn = Table(("outcome of the drawn poses", "draws"), tuple(counts))
-    return [(drawn, present.facts(bounds, choice)), "Cramér-Rao bounds over all candidates, with the usual noise."]
+    outcomes = Table(("outcome of the drawn poses", "draws"), tuple(counts))
+    return [(outcomes, present.facts(bounds, choice)), "Cramér-Rao bounds over all candidates, with the usual noise."]
 
 
 def _matrix(T: Any) -> Markup:
@@ -405,12 +405,12 @@ def _matrix(T: Any) -> Markup:
     return Markup("<pre>{}</pre>").format("\n".join(lines))
 
 
-def _cards(found: Facts) -> list[Card]:
-    aside, poses, reached = found["set_aside"], found["poses"], found["punctures"]
-    expected = number(found["predicted_tre_mm"], 2, "mm")
+def _cards(facts: Facts) -> list[Card]:
+    aside, poses, reached = facts["set_aside"], facts["poses"], facts["punctures"]
+    expected = number(facts["predicted_tre_mm"], 2, "mm")
     cards = [
-        Card("expected error of the calibration", expected, f"rms at the tip: {counted(found)}"),
-        Card("residuals", number(found["residual_rms_mm"], 2, "mm"), "rms over the poses used"),
+        Card("expected error of the calibration", expected, f"rms at the tip: {counted(facts)}"),
+        Card("residuals", number(facts["residual_rms_mm"], 2, "mm"), "rms over the poses used"),
         Card("poses", f"{poses - len(aside)} of {poses}", f"set aside: {', '.join(aside) or 'none'}"),
     ]
     if reached is not None:
@@ -422,10 +422,10 @@ def _cards(found: Facts) -> list[Card]:
     return cards
 
 
-def residual_picture(found: Calibration, recording: Recording) -> bytes:
+def residual_picture(calibration: Calibration, recording: Recording) -> bytes:
     """A PNG of each pose's residual in the image frame: its three components, and v over u; set aside by name."""
-    rotated = np.einsum("nji,nj->ni", recording.A[:, :3, :3] @ found.X[:3, :3], found.residuals)
-    aside = np.isin(recording.names, found.outliers)
+    rotated = np.einsum("nji,nj->ni", recording.A[:, :3, :3] @ calibration.X[:3, :3], calibration.residuals)
+    aside = np.isin(recording.names, calibration.outliers)
     figure = Figure(figsize=(12.0, 4.0), dpi=110, layout="constrained")
     by_pose, in_image = figure.subplots(1, 2)
     for axis, label in enumerate(("u, along the face", "v, into the depth", "across the slice")):

@@ -36,7 +36,7 @@ NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 def servo_facts(case: ServoCase, trials: Sequence[stereo_session.ServoTrial], ours: Facts) -> dict[str, Any]:
     """A case's sessions, each seed and all together, and the needle against the anatomy, predicted beside realised."""
     test, rows = stereo_session.declaration_test(trials), [row for one in trials for row in one.targets]
-    found = {
+    needles = {
         phase: stereo_session.needle_statistics([getattr(row, f"needle_{phase}") for row in rows]) for phase in PHASES
     }
     return {
@@ -48,7 +48,7 @@ def servo_facts(case: ServoCase, trials: Sequence[stereo_session.ServoTrial], ou
         "statistics": ours,
         "sessions": [{key: value for key, value in plain(one).items() if key != "declaration"} for one in trials],
         "needle": {
-            **found,
+            **needles,
             "hit_radius_mm": case.file.target.hit_radius_mm,
             "p_touch": None,
             "p_touch_note": NO_TOUCH,
@@ -68,7 +68,7 @@ LOOK = (
 
 
 def recording_text(facts: Facts) -> str:
-    """What a recorded session says, for a terminal."""
+    """Text of a recorded session."""
     pixels = " and ".join(number(rms, 3) for rms in facts["calibration_rms_px"])
     rows = [
         ("cameras", f"residuals of {pixels} px (rms)"),
@@ -105,7 +105,7 @@ def write_servo_page(
 
 
 def sections(facts: Facts, pictures: Sequence[Path] = ()) -> list[Section]:
-    """Everything that is shown: the first seed, all seeds, needle, calibration; pictures of convergence and cameras."""
+    """Sections of the sessions: the first seed, all seeds, needle, calibration; pictures of convergence and cameras."""
     first, shown = facts["sessions"][0], list[Section]()
     if pictures:
         plot = present.picture(pictures[0], "Distance from ball to estimated target against corrections")
@@ -254,8 +254,8 @@ class Sessions(NamedTuple):
     ours: dict[str, Any]
 
 
-def hold_sessions(case: ServoCase, seeds: int, done: Count = uncounted, record: Path | None = None) -> Sessions:
-    """Hold the sessions of a case, from its own seed on; all that the first one's devices say goes into ``record``."""
+def run_sessions(case: ServoCase, seeds: int, done: Count = uncounted, record: Path | None = None) -> Sessions:
+    """Run the sessions of a case, from its own seed on; all readings of the first one's devices go into ``record``."""
     seed = case.file.seed
     first = stereo_session.run_session(case, seed, record=record)
     done(1, seeds)
@@ -267,14 +267,14 @@ def hold_sessions(case: ServoCase, seeds: int, done: Count = uncounted, record: 
 def run_servo(
     path: Path, out_dir: Path, seeds: int, done: Count, note: Callable[[str], None] | None, record: Path | None
 ) -> Answer:
-    """Hold the sessions of a case, write pictures, plot and page, and what the first one's devices say into ``record``.
+    """Run the sessions of a case, write pictures, plot and page, and the readings of the first one into ``record``.
 
     Raises InputError: The case cannot be used. NoAnswerError: The first session could not be held.
     """
     case = load_servo_case(path)
     with writing(out_dir, "servo", inputs=case.inputs, names=NAMES, note=note) as draft:
-        with new_folder(record) as kept:
-            held = hold_sessions(case, seeds, done, kept)
+        with new_folder(record) as record_folder:
+            held = run_sessions(case, seeds, done, record_folder)
         facts = servo_facts(case, held.trials, held.ours)
         written = session_files(held, facts, draft.folder)
     facts["files"] = [str(path) for path in draft.final(written)]
@@ -289,7 +289,7 @@ def refuse_with_recording(out_dir: Path | None, record: Path | None, seeds: int)
 
 
 def follow_recording(path: Path, recording: Path) -> Answer:
-    """Calibrate and map from a recorded session, and say what each of its looks at the ball says.
+    """Calibrate and map from a recorded session, and evaluate each of its looks at the ball.
 
     Raises InputError: Case or recording cannot be used. NoAnswerError: A point or a marker is not found in its
     pictures.

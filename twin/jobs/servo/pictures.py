@@ -1,4 +1,4 @@
-"""Pictures of a session: the workcell through each camera, and how the servo came to rest."""
+"""Pictures of a session: the workcell through each camera, and the convergence of the servo."""
 
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
 
 
 def _workcell_picture(session: Session, reached: Reached, camera: Camera) -> NDArray[np.uint8]:
-    """The true room by PyBullet, through the camera without its lens's distortion."""
+    """The true workcell by PyBullet, through the camera without its lens's distortion."""
     workcell, file = session.workcell, session.workcell.case.file
     T_base_c = np.linalg.inv(workcell.T_c_base)
     tool = Tool(file.tool.rod_mm, file.tool.rod_mm - file.tool.holder_mm, file.tool.rod_diameter_mm,
@@ -88,7 +88,7 @@ def _annotate(axes: Axes, session: Session, reached: Reached, number: int) -> No
 
 
 def _inset(axes: Axes, session: Session, reached: Reached, number: int) -> None:
-    """What is really measured: the analytic picture of the ball, enlarged, with the outline that was found."""
+    """What the camera measures: the analytic picture of the ball, enlarged, with the outline that was found."""
     workcell, tool = session.workcell, session.workcell.case.file.tool
     camera, believed = workcell.cameras[number], session.calibration.cameras[number]
     seen, plan = reached.servoed.visits[-1].seen.ball_c, workcell.case.file.cameras

@@ -30,7 +30,7 @@ WIDTH, HEIGHT = 1690, 1222
 DISC = ((583 - RADIUS) / WIDTH, 1 - (642 + RADIUS) / HEIGHT, 2 * RADIUS / WIDTH, 2 * RADIUS / HEIGHT)
 SIDE_WIDE, SIDE_HIGH = 515, 1039
 SIDE = (1158 / WIDTH, 1 - (122 + SIDE_HIGH) / HEIGHT, SIDE_WIDE / WIDTH, SIDE_HIGH / HEIGHT)
-"""Of the picture: left, lower edge, width and height of the disc and of the column beside it; labels stand around the
+"""In the picture: left, lower edge, width and height of the disc and of the column beside it; labels stand around the
 disc."""
 
 SMALL = 9.5  # points: letters of the column
@@ -54,7 +54,7 @@ def draw_map(
 def map_figure(
     candidates: Candidates, case: Any, pick: Pick | None = None, raster: MapRaster | None = None, scan: Any = None
 ) -> Figure:
-    """The map, of a raster that somebody has already; lengths in the digits of a scan's voxels.
+    """The figure of the map, of a raster that was drawn before; lengths in the digits of a scan's voxels.
 
     The disc is the first of its axes, the column the second.
     """
@@ -76,7 +76,7 @@ def map_figure(
 
 
 def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None, scan: Any | None) -> None:
-    """What the colours and marks mean, the chosen direction, and how to read the map; y 0..1 runs downwards."""
+    """Draw the key of colours and marks, the chosen direction, and how to read the map; y 0..1 runs downwards."""
     axes.set_axis_off()
     axes.set(xlim=(0, 1), ylim=(1, 0), autoscale_on=False)
     y = _reasons(axes, numbers.reason_counts(candidates))
@@ -111,13 +111,13 @@ def _key(axes: Axes, y: float, handles: Sequence[Artist], title: str = "", **loo
 
 
 def _reasons(axes: Axes, counts: Sequence[numbers.ReasonCount]) -> float:
-    """A patch, a text and numbers for each reason, with the lines that the map has over its colour."""
+    """Draw the key of reasons: a patch, a text and numbers each, with the lines that the map has over its colour."""
     handles = []
     for one in counts:
         hatch, ink = "", "black"
         if one.code == Reason.UNKNOWN_REGION.value:
-            beside = one.colour == UNSEEN_AIR
-            hatch, ink = "\\\\" if beside else "//", css(map_raster.HATCH_AIR if beside else map_raster.HATCH)
+            in_air = one.colour == UNSEEN_AIR
+            hatch, ink = "\\\\" if in_air else "//", css(map_raster.HATCH_AIR if in_air else map_raster.HATCH)
         text = textwrap.fill(f"{one.text}: {one.count:,} ({percent(one.solid_angle)})", LETTERS)
         handles.append(Patch(facecolor=css(one.colour), edgecolor=ink, hatch=hatch, label=text))
     lines = sum(str(one.get_label()).count("\n") + 1 for one in handles)
@@ -183,15 +183,15 @@ def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float, sca
         look |= {"fontsize": 13, "weight": "bold", "color": "#a02000"}
     else:
         word = "Best" if pick == candidates.best else "Chosen"
-        found, row = pick
-        theta, beta, known, chances = np.degrees(found.theta[row]), np.degrees(found.beta[row]), "", found.chances
-        if chances is not None and np.isfinite(chances.hit[row]):
+        searched, row = pick
+        theta, beta, known = np.degrees(searched.theta[row]), np.degrees(searched.beta[row]), ""
+        if (chances := searched.chances) is not None and np.isfinite(chances.hit[row]):
             hit, touch = chance_text(float(chances.hit[row])), chance_text(float(chances.touch_any[row]))
             known = f"; p(hit) {hit}, p(touch) {touch}{'' if chances.refined[row] else ' to first order'}"
         text = (
             f"{word}: θ {theta:.4g}°, β {beta:.4g}°{known}\n"
-            f"path in the body {numbers.length_text(float(found.path.length[row]), scan)}, "
-            f"skin angle {number(float(np.degrees(found.path.skin_angle[row])), 0)}°\n"
-            f"{numbers.nearest_text(found, row, scan)}"
+            f"path in the body {numbers.length_text(float(searched.path.length[row]), scan)}, "
+            f"skin angle {number(float(np.degrees(searched.path.skin_angle[row])), 0)}°\n"
+            f"{numbers.nearest_text(searched, row, scan)}"
         )
     axes.text(0.017, y + 0.008, text, **look)

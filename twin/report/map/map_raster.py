@@ -1,4 +1,4 @@
-"""The map as pixels, each of which asks which grid cell it lies in: no gap and no moire can arise.
+"""The map as pixels, each coloured by the grid cell in which it lies: no gap and no moire can arise.
 
 It is finer than anything that shows it, which smooths the cells' borders. A large Pareto front is thinned, and says so:
 hundreds of dots would hide the shades below.
@@ -59,7 +59,7 @@ class ClearanceScale(NamedTuple):
 
     @property
     def even(self) -> bool:
-        """Whether all are one to whoever reads them: then there is one shade, and no scale."""
+        """Whether all clearances read the same: then there is one shade, and no scale."""
         return round(self.low, SCALE_DIGITS) == round(self.high, SCALE_DIGITS)
 
     def shades(self, clearance: Floats) -> NDArray[np.uint8]:
@@ -70,7 +70,7 @@ class ClearanceScale(NamedTuple):
 
 
 def clearance_scale(candidates: Candidates) -> ClearanceScale:
-    """From the least to the greatest clearance among the safe directions; infinite where there is none to speak of."""
+    """Range of the clearances of the safe directions; infinite where none has a margin."""
     values = candidates.least_clearance[candidates.safe]
     values = values[np.isfinite(values)]
     if len(values) == 0:
@@ -92,7 +92,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
 
 
 def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> MapRaster:
-    """Draw the cap."""
+    """The raster of the cap of directions."""
     rows = MapCells.of(candidates).picture(view, size)
     table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)
     table[:-1, :3] = row_colours(candidates)
@@ -103,7 +103,7 @@ def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> Map
 
 
 def _hatch(rgba: NDArray[np.uint8], rows: Ints, candidates: Candidates) -> None:
-    """Lines over what is unknown, in place: rising in the body, falling beside it, others where nobody looked."""
+    """Draw lines over what is unknown, in place: rising in the body, falling in air, others where not tested."""
     unknown, air = candidates.verdict.reason == Reason.UNKNOWN_REGION.value, candidates.unseen_air
     line, column = np.arange(len(rows))[:, None], np.arange(len(rows))
     middle = (len(rows) - 1) / 2
@@ -144,12 +144,12 @@ def shown_front(candidates: Candidates, view: MapView) -> ShownFront:
 
 
 def _apart(places: Floats, spacing: float) -> Ints:
-    """Which of the points (n, 2) lie no nearer than a distance to any that was kept before them."""
-    kept: list[int] = []
+    """Rows of the points (n, 2) that lie no nearer than a distance to any that was taken before them."""
+    spaced: list[int] = []
     for i, place in enumerate(places):
-        if not kept or np.linalg.norm(places[kept] - place, axis=1).min() >= spacing:
-            kept.append(i)
-    return np.array(kept, dtype=np.int64)
+        if not spaced or np.linalg.norm(places[spaced] - place, axis=1).min() >= spacing:
+            spaced.append(i)
+    return np.array(spaced, dtype=np.int64)
 
 
 RADIUS = 412  # of the disc, pixels
@@ -176,7 +176,7 @@ class Label(NamedTuple):
 
 
 def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRaster, pick: Pick | None) -> None:
-    """Draw it on square axes of 2 `RADIUS` pixels, in the disc's radii; what stands at the rim lies outside of them."""
+    """Draw the map on square axes of 2 `RADIUS` pixels, in the disc's radii; labels of the rim lie outside of them."""
     axes.set_axis_off()
     axes.set(xlim=(-1, 1), ylim=(-1, 1), autoscale_on=False)
     codes, names = region_codes(candidates.verdict, raster.rows)
@@ -211,7 +211,7 @@ def _write(axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
 
 
 def _edges(values: Ints, *, named: bool = False) -> Bools:
-    """Pixels beside which another value lies; where ``named``, of two that are not 0."""
+    """Pixels that border on another value; where ``named``, of two that are not 0."""
     shown = np.where(values == 0, np.iinfo(np.int64).max, values) if named else values
     least = ndimage.minimum_filter(shown, 3)
     most = ndimage.maximum_filter(values, 3)
@@ -220,8 +220,8 @@ def _edges(values: Ints, *, named: bool = False) -> Bools:
 
 def _frame(axes: Axes, view: MapView) -> None:
     for ring, radius in ring_radii(view):
-        wide = 1.6 if ring == 90 and view.theta_max > BEYOND else 0.7
-        axes.add_patch(Circle((0, 0), radius, fill=False, lw=wide, alpha=0.45))
+        line_width = 1.6 if ring == 90 and view.theta_max > BEYOND else 0.7
+        axes.add_patch(Circle((0, 0), radius, fill=False, lw=line_width, alpha=0.45))
     axes.add_patch(Circle((0, 0), 1, fill=False, lw=1.2, clip_on=False))
     for beta in range(0, 360, 30):
         angle = np.radians(beta) + view.turn
@@ -232,9 +232,9 @@ def _frame(axes: Axes, view: MapView) -> None:
     for text, angle in view.rim:
         # Upright at the sides, so that long words stay in the picture.
         side = abs(np.cos(angle)) > 0.8 and len(text) > 3
-        turned = (90 if np.cos(angle) < 0 else -90) if side else 0
+        text_angle = (90 if np.cos(angle) < 0 else -90) if side else 0
         x, y = 1.215 * np.cos(angle), 1.16 * np.sin(angle)
-        axes.text(x, y, text, rotation=turned, ha="center", va="center", fontsize=14, weight="bold")
+        axes.text(x, y, text, rotation=text_angle, ha="center", va="center", fontsize=14, weight="bold")
 
 
 def ring_radii(view: MapView) -> list[tuple[int, float]]:
@@ -267,9 +267,9 @@ def chance_raster(candidates: Candidates, rows: Ints) -> Floats | None:
         return None
     picture = np.append(chance, np.nan)[rows]
     known = np.isfinite(picture)
-    wide = SMOOTHED * len(rows)
-    weight = ndimage.gaussian_filter(known.astype(float), wide)
-    smooth = ndimage.gaussian_filter(np.where(known, picture, 0.0), wide) / np.maximum(weight, 1e-9)
+    smoothed = SMOOTHED * len(rows)
+    weight = ndimage.gaussian_filter(known.astype(float), smoothed)
+    smooth = ndimage.gaussian_filter(np.where(known, picture, 0.0), smoothed) / np.maximum(weight, 1e-9)
     return np.asarray(np.where(known, smooth, np.nan))
 
 
@@ -323,10 +323,10 @@ def region_labels(codes: Ints, names: Sequence[str], written: Sequence[Label]) -
             regions.append((float(areas[part - 1]), depth, name))
     for _, depth, structure in sorted(regions, key=lambda region: -region[0]):
         text = structure.replace("_", " ")
-        high, wide = _half_size(text, len(coarse))
-        space = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
+        rows, columns = _half_size(text, len(coarse))
+        space = np.where(ndimage.minimum_filter(free, (2 * rows + 1, 2 * columns + 1)), depth, 0.0)
         row, column = np.unravel_index(int(np.where(space.any(), space, depth).argmax()), depth.shape)
-        _take(free, int(row), int(column), high, wide)
+        _take(free, int(row), int(column), rows, columns)
         x, y = (column + 0.5) / len(coarse) * 2 - 1, 1 - (row + 0.5) / len(coarse) * 2
         labels.append(Label(float(x), float(y), text))
     return labels
@@ -338,6 +338,6 @@ def _half_size(text: str, size: int) -> tuple[int, int]:
     return round(LETTER_HIGH * len(lines) * scale), round(LETTER_WIDE * (max(map(len, lines)) + 1) * scale)
 
 
-def _take(free: Bools, row: int, column: int, high: int, wide: int) -> None:
-    """Mark a name's box about a pixel, half so high and wide, in place."""
-    free[max(0, row - high) : row + high + 1, max(0, column - wide) : column + wide + 1] = False
+def _take(free: Bools, row: int, column: int, rows: int, columns: int) -> None:
+    """Mark a name's box, so many rows and columns to each side of a pixel, in place."""
+    free[max(0, row - rows) : row + rows + 1, max(0, column - columns) : column + columns + 1] = False

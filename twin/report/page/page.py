@@ -35,17 +35,17 @@ EPOCH = "SOURCE_DATE_EPOCH"  # seconds since 1970 that stand for "now", for the 
 
 
 class Uncertainty(NamedTuple):
-    """What a page says of chances; `breakdown` and `budget` are of the chosen direction, `rooms` a `Distribution`'s."""
+    """Chances on a page; `breakdown` and `budget` are of the chosen direction, `trials` sums up a `Distribution`."""
 
     breakdown: UncertaintyBreakdown | None
-    rooms: Mapping[str, Any] | None = None
+    trials: Mapping[str, Any] | None = None
     picture: Path | None = None
     budget: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Shown(Scene):
-    """What a page shows."""
+    """Content of the page of a run."""
 
     rehearsal: Any | None = None
     registration: Mapping[str, Any] | None = None
@@ -61,11 +61,11 @@ class Shown(Scene):
 
 def write_page(shown: Shown, path: Path) -> None:
     """Write the page; it appears whole or not at all."""
-    case, found, plan, done = shown.case, shown.candidates, shown.plan, shown.rehearsal
+    case, candidates, plan, done = shown.case, shown.candidates, shown.plan, shown.rehearsal
     at_patient, away = () if shown.facts is None else shown.facts.rows(), numbers.demanding(shown.anatomy)
     declared, scan = shown.uncertainty is not None, shown.anatomy.scan
     point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
-    study, warned = scan_date(case), (*(one.sentence for one in found.findings), *shown.anatomy.warnings)
+    study, warned = scan_date(case), (*(one.sentence for one in candidates.findings), *shown.anatomy.warnings)
     noted = tuple(one.sentence for one in shown.anatomy.findings if one.severity is Severity.NOTE)
     rehearsed: list[present.Block] = []
     if done is not None:
@@ -81,12 +81,12 @@ def write_page(shown: Shown, path: Path) -> None:
         dates=dates_text(study),
         needle=numbers.needle_text(case),
         tones=() if scan is None else tuple(TONES),
-        methods=methods_text(case, shown.anatomy, found),
+        methods=methods_text(case, shown.anatomy, candidates),
         notice=numbers.TRUTH_IS_BELIEF if done is not None and done.truth_is_belief else "",
-        refused="" if found.safe.any() else _all_rejected(found),
+        refused="" if candidates.safe.any() else _all_rejected(candidates),
         cards=_cards(shown),
-        counts=present.blocks_html(patient.counts(found)),
-        best=present.blocks_html(patient.windows(found, scan)),
+        counts=present.blocks_html(patient.counts(candidates)),
+        best=present.blocks_html(patient.windows(candidates, scan)),
         plan=present.blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
         planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
         registration=present.blocks_html(patient.registration(shown.registration)) if shown.registration else "",
@@ -106,12 +106,12 @@ def write_page(shown: Shown, path: Path) -> None:
 
 
 def _script_data(shown: Shown) -> tuple[dict[str, Any], bytes, bytes]:
-    """What the page's script draws, and what its slices need: the CT, and the surfaces that they cut."""
-    case, found, pick = shown.case, shown.candidates, shown.chosen
-    subject = shown.subject or Subject(case, shown.anatomy, pick or Pick(found, 0))
-    slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
+    """Data of the page's script, and the bytes of its slices: the CT, and the surfaces that they cut."""
+    case, candidates, pick = shown.case, shown.candidates, shown.chosen
+    subject = shown.subject or Subject(case, shown.anatomy, pick or Pick(candidates, 0))
+    slices, ct, surfaces = slices_data(subject, candidates, picked_row(candidates, pick), shown.regions_ct)
     data = {
-        "map": map_data(case, found, pick, shown.raster),
+        "map": map_data(case, candidates, pick, shown.raster),
         "scene": scene_figure(shown),
         "arm": arm_data(shown),
         "slices": slices,
@@ -121,9 +121,9 @@ def _script_data(shown: Shown) -> tuple[dict[str, Any], bytes, bytes]:
     return data, ct, surfaces
 
 
-def _all_rejected(found: Candidates) -> str:
-    counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in found.counts().items())
-    return f"{plural(len(found), 'direction')} searched, all rejected ({counts})."
+def _all_rejected(candidates: Candidates) -> str:
+    counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in candidates.counts().items())
+    return f"{plural(len(candidates), 'direction')} searched, all rejected ({counts})."
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -133,13 +133,13 @@ def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[s
     costs = "Error sources, and the effect of single changes"
     budget = patient.budget(facts)
     budget[1:1] = [] if facts is None else [present.picture(png(budget_figure(facts)), costs)]
-    rooms = patient.rooms(uncertainty.rooms)
-    if rooms and tips is not None:
-        rooms.append(present.picture(tips, "Tips of all trials in the frame of the needle"))
+    trials = patient.trials(uncertainty.trials)
+    if trials and tips is not None:
+        trials.append(present.picture(tips, "Tips of all trials in the frame of the needle"))
     return {
         "chances": present.blocks_html(patient.chances(uncertainty.breakdown, registration)),
         "budget": present.blocks_html(budget) if budget else None,
-        "rooms": present.blocks_html(rooms),
+        "rooms": present.blocks_html(trials),
     }
 
 
@@ -158,11 +158,11 @@ def _cards(shown: Shown) -> list[Card]:
         cards.append(Card("chance to hit", chance_text(breakdown.p_hit), detail))
     cards.append(_window_card(candidates))
     if shown.chosen is not None:
-        (found, row), scan = shown.chosen, shown.anatomy.scan
-        path = numbers.length_text(float(found.path.length[row]), scan)
-        detail = f"{path} in the body; {numbers.nearest_text(found, row, scan)}"
+        (searched, row), scan = shown.chosen, shown.anatomy.scan
+        path = numbers.length_text(float(searched.path.length[row]), scan)
+        detail = f"{path} in the body; {numbers.nearest_text(searched, row, scan)}"
         name = "best direction" if shown.chosen == candidates.best else "chosen direction"
-        cards.append(Card(name, _angles(found, row), detail))
+        cards.append(Card(name, _angles(searched, row), detail))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if shown.plan is None:
@@ -179,15 +179,15 @@ def _cards(shown: Shown) -> list[Card]:
 
 
 def _window_card(candidates: Candidates) -> Card:
-    """What a person can aim at, before how much of all directions that is."""
+    """The card of the largest window on the skin, and the fraction of all directions that is safe."""
     windows = candidates.windows
     largest = windows.largest
-    value, wide = ("", "") if largest is None else (f"{largest.entry_cm2:.1f} cm²", f"{largest.wide_deg:.0f}° wide")
+    area, width = ("", "") if largest is None else (f"{largest.entry_cm2:.1f} cm²", f"{largest.wide_deg:.0f}° wide")
     solid = present.percent(next(line.solid_angle for line in numbers.reason_counts(candidates) if line.code == "safe"))
     return Card(
         "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
-        value,
-        f"the largest window on the skin, {wide}; in {plural(len(windows), 'window')} {solid} of the solid angle",
+        area,
+        f"the largest window on the skin, {width}; in {plural(len(windows), 'window')} {solid} of the solid angle",
     )
 
 
@@ -196,7 +196,7 @@ def _angles(candidates: Candidates, row: int) -> str:
 
 
 def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
-    """What was checked, by what, and what was not."""
+    """Text of the methods: what was checked, by what, and what was not."""
     theta, step = np.degrees(candidates.theta), np.degrees(step_of(candidates))
     checked = sum(1 for one in anatomy.checked if str(one.role) in {"avoid", "unknown"})
     arm = "The arm was not checked."
@@ -247,7 +247,7 @@ def scan_date(case: Any) -> str:
         if is_dicom_file(path):
             from puncture_twin.planning.formats.dicom.recognise import recognise  # with pydicom: few cases need it
 
-            found = recognise(path)
-            if found is not None and found.is_slice:
-                return found.date
+            file = recognise(path)
+            if file is not None and file.is_slice:
+                return file.date
     return ""

@@ -1,4 +1,4 @@
-"""What the page's script draws: the map, a picture of the cap with the rows behind it for the pointer, and the scene.
+"""Data of the page's script: the map, a picture of the cap with the rows behind it for the pointer, and the scene.
 
 The scene's bodies are those of the picture, with fewer triangles for a browser, as plotly traces.
 """
@@ -52,12 +52,12 @@ def picked_row(candidates: Candidates, pick: Pick | None) -> int:
     if pick.candidates is candidates:
         return pick.row
     theta, beta = pick.candidates.theta[pick.row], pick.candidates.beta[pick.row]
-    same = np.flatnonzero(np.isclose(candidates.theta, theta) & np.isclose(candidates.beta, beta))
-    return int(same[0]) if len(same) else len(candidates)
+    matches = np.flatnonzero(np.isclose(candidates.theta, theta) & np.isclose(candidates.beta, beta))
+    return int(matches[0]) if len(matches) else len(candidates)
 
 
 def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRaster | None = None) -> dict[str, Any]:
-    """What the page's script needs to draw the map and answer the pointer; plain values, degrees and mm.
+    """Data with which the page's script draws the map and answers the pointer; plain values, degrees and mm.
 
     The pixel-to-row table is stored run by run, row after row of the picture: ``runs`` is [candidate, length, ...],
     candidate -1 outside the grid. A pick that the search has no row of is one row more.
@@ -97,10 +97,10 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
 
 
 def _directions(parts: Sequence[tuple[Candidates, Ints, Ints]]) -> dict[str, Any]:
-    """What is said of each direction, a list a column; structures, reasons and sentences by their places."""
-    verdicts = [found.verdict.of(rows) for found, rows, _ in parts]
+    """Facts of each direction, a list a column; structures, reasons and sentences by their places."""
+    verdicts = [candidates.verdict.of(rows) for candidates, rows, _ in parts]
     named = {str(name) for one in verdicts for name in one.named}
-    structures = sorted(named.union(*(found.clearance.structures for found, *_ in parts)))
+    structures = sorted(named.union(*(candidates.clearance.structures for candidates, *_ in parts)))
     reasons = sorted({str(reason) for one in verdicts for reason in one.reason})
     sentences = sorted({str(text) for one in verdicts for text in one.detail})
     columns = [_columns(*part, structures, reasons, sentences) for part in parts]
@@ -115,28 +115,28 @@ def _directions(parts: Sequence[tuple[Candidates, Ints, Ints]]) -> dict[str, Any
 
 
 def _columns(
-    found: Candidates, rows: Ints, window: Ints, structures: list[str], reasons: list[str], sentences: list[str]
+    candidates: Candidates, rows: Ints, window: Ints, structures: list[str], reasons: list[str], sentences: list[str]
 ) -> dict[str, list[Any]]:
-    verdict, path, arm = found.verdict.of(rows), found.path, found.arm
+    verdict, path, arm = candidates.verdict.of(rows), candidates.path, candidates.arm
     index = {name: i for i, name in enumerate(structures)}
     columns = {
-        "theta": _rounded(np.degrees(found.theta[rows]), 5),
-        "beta": _rounded(np.degrees(found.beta[rows]), 5),
+        "theta": _rounded(np.degrees(candidates.theta[rows]), 5),
+        "beta": _rounded(np.degrees(candidates.beta[rows]), 5),
         "reason": [reasons.index(str(r)) for r in verdict.reason],
         "structure": [index[str(s)] for s in verdict.named],
         "sentence": [sentences.index(str(text)) for text in verdict.detail],
         "depth": _rounded(verdict.depth, 1),
         "amount": _rounded(verdict.amount, 2),
-        "near": _near(found, rows, index),
+        "near": _near(candidates, rows, index),
         "path": _rounded(path.length[rows], 3),
         "skin_angle": _rounded(np.degrees(path.skin_angle[rows]), 1),
-        "rank": found.ranking.rank[rows].tolist(),
+        "rank": candidates.ranking.rank[rows].tolist(),
         "window": window[rows].tolist(),
-        "safe_cone": _rounded(np.degrees(found.safe_cone[rows]), 1),
+        "safe_cone": _rounded(np.degrees(candidates.safe_cone[rows]), 1),
         "reachable": arm.reachable[rows].tolist(),
-        "outward": _rounded(found.outward_ct[rows].ravel(), 6),
+        "outward": _rounded(candidates.outward_ct[rows].ravel(), 6),
     }
-    chances = found.chances
+    chances = candidates.chances
     if chances is not None:  # what is not there is not spoken of
         columns |= {
             "p_hit": _rounded(chances.hit[rows], 9),
@@ -146,17 +146,17 @@ def _columns(
     return columns
 
 
-def _near(found: Candidates, rows: Ints, index: dict[str, int]) -> list[list[float]]:
+def _near(candidates: Candidates, rows: Ints, index: dict[str, int]) -> list[list[float]]:
     """As `Subject.near`, of every row: place, mm, place, mm, and so on; at least the nearest, however far it is."""
-    demanding = np.flatnonzero(np.isfinite(found.clearance.margins))
-    distance = found.clearance.by_structure[np.ix_(rows, demanding)]
+    demanding = np.flatnonzero(np.isfinite(candidates.clearance.margins))
+    distance = candidates.clearance.by_structure[np.ix_(rows, demanding)]
     order = np.argsort(distance, axis=1, kind="stable")[:, :MOST_NEAR]
     nearest = np.round(np.take_along_axis(distance, order, axis=1), 3)
-    kept = np.isfinite(nearest) & ((nearest < NEAR_MM) | (np.arange(order.shape[1]) == 0))
-    places = np.array([index[name] for name in found.clearance.structures], int)[demanding]
+    shown = np.isfinite(nearest) & ((nearest < NEAR_MM) | (np.arange(order.shape[1]) == 0))
+    places = np.array([index[name] for name in candidates.clearance.structures], int)[demanding]
     return [
         [value for k in np.flatnonzero(keep) for value in (int(places[one[k]]), float(mm[k]))]
-        for one, mm, keep in zip(order, nearest, kept, strict=True)
+        for one, mm, keep in zip(order, nearest, shown, strict=True)
     ]
 
 
@@ -231,7 +231,7 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
 
 
 def arm_data(scene: Scene) -> dict[str, Any] | None:
-    """With which the page's script moves the links to every direction that the arm reaches; None without them.
+    """Data with which the page's script moves the links to every direction that the arm reaches; None without them.
 
     Denavit and Hartenberg's lengths, where the base is, the joints of the scene's meshes, and those of each row, rad.
     """

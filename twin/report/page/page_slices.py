@@ -36,7 +36,7 @@ SOFT_HU = (-160.0, 240.0)  # where the page states the error of a lossy CT
 def slices_data(
     subject: Subject, candidates: Candidates, picked: int, regions_ct: Floats | None
 ) -> tuple[dict[str, Any], bytes, bytes]:
-    """What the page's slices are made of: facts, and the bytes of CT and surfaces.
+    """Data of the page's slices: facts, and the bytes of CT and surfaces.
 
     Entries of the search's candidates say how far the block reaches; `picked` is the direction's row on the page. The
     regions of the tip are (n, 3, 3), mm^2, NaN where not known; None without declared errors.
@@ -71,8 +71,8 @@ def slices_data(
         "regions": {} if regions_ct is None else _regions(regions_ct, picked, subject.region_ct),
         "margins": {
             name: float(mm)
-            for found in (candidates, *(() if subject.pick is None else (subject.pick.candidates,)))
-            for name, mm in zip(found.clearance.structures, found.clearance.margins, strict=True)
+            for searched in (candidates, *(() if subject.pick is None else (subject.pick.candidates,)))
+            for name, mm in zip(searched.clearance.structures, searched.clearance.margins, strict=True)
             if np.isfinite(mm)
         },
     }
@@ -83,12 +83,12 @@ def _regions(regions_ct: Floats, picked: int, of_picked: Floats | None) -> dict[
     """The upper triangle of each direction's region, mm^2; of the picked one as it is planned."""
     upper = np.triu_indices(3)
     known = np.flatnonzero(np.isfinite(regions_ct).all(axis=(1, 2)))
-    found = dict(zip(known.tolist(), np.round(regions_ct[known][:, *upper], 3).tolist(), strict=True))
-    return found if of_picked is None else found | {picked: np.round(of_picked[upper], 3).tolist()}
+    regions = dict(zip(known.tolist(), np.round(regions_ct[known][:, *upper], 3).tolist(), strict=True))
+    return regions if of_picked is None else regions | {picked: np.round(of_picked[upper], 3).tolist()}
 
 
 def block_box(target_ct: Floats, candidates: Candidates) -> Floats:
-    """What the block holds, (2, 3), mm: target, the safe entries, or all if none is, and `AROUND_MM` about them."""
+    """Box of the block, (2, 3), mm, about target, the safe entries, or all if none is, and `AROUND_MM` about them."""
     entries = candidates.path.entry_ct[candidates.safe if candidates.safe.any() else slice(None)]
     points = np.concatenate([np.asarray(target_ct)[None], entries[np.isfinite(entries).all(axis=1)]])
     return np.stack([points.min(axis=0) - AROUND_MM, points.max(axis=0) + AROUND_MM])
@@ -133,8 +133,8 @@ def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = M
 
 def _exact(values: NDArray[np.uint8]) -> Packed:
     """Bytes less the mean of their three neighbours before, x fastest: they pack to two thirds."""
-    wide = np.pad(values, ((1, 0),) * 3).astype(np.int16)
-    before = (wide[:-1, 1:, 1:] + wide[1:, :-1, 1:] + wide[1:, 1:, :-1]) // 3
+    padded = np.pad(values, ((1, 0),) * 3).astype(np.int16)
+    before = (padded[:-1, 1:, 1:] + padded[1:, :-1, 1:] + padded[1:, 1:, :-1]) // 3
     content = (values - before).astype(np.uint8).transpose(2, 1, 0).tobytes()
     return Packed({"shape": values.shape}, gzip.compress(content, LEVEL, mtime=0))
 
@@ -166,17 +166,17 @@ def _lossy(values: NDArray[np.uint8], most: int) -> Packed:
         low, high = (middle, high) if fits else (low, middle - 1)
     packed = [_jpeg(one, low) for one in strips]
     shown = [np.asarray(Image.open(io.BytesIO(one))) for one in packed]
-    found = np.concatenate(shown).reshape(slices.shape)[:, : values.shape[1]].transpose(2, 1, 0)
+    decoded = np.concatenate(shown).reshape(slices.shape)[:, : values.shape[1]].transpose(2, 1, 0)
     hu_of = np.interp(np.arange(256), KNOTS_BYTE, KNOTS_HU).astype(np.float32)
     true = hu_of[values]
-    soft = (hu_of[found] - true)[(true > SOFT_HU[0]) & (true < SOFT_HU[1])]
+    soft = (hu_of[decoded] - true)[(true > SOFT_HU[0]) & (true < SOFT_HU[1])]
     facts = {
         "shape": values.shape,
         "strips": [
             [len(one), len(rows) // slices.shape[1], rows.mean()] for one, rows in zip(packed, shown, strict=True)
         ],
         "rows": slices.shape[1],
-        "rms_bytes": float(np.sqrt(np.square(found - values.astype(np.float32)).mean())),
+        "rms_bytes": float(np.sqrt(np.square(decoded - values.astype(np.float32)).mean())),
         "rms_hu": float(np.sqrt(np.square(soft).mean())) if len(soft) else 0.0,
         "worst_hu": float(np.abs(soft).max(initial=0.0)),
     }

@@ -29,7 +29,7 @@ COARSE_MM = 32.0  # how coarse surfaces beyond the box are, and how far beyond: 
 SMOOTH, ROUNDS = 0.3, 3  # by how much of the allowed distance stairs are smoothed along each axis, and how often
 QUADRIC = 2.0  # of the allowed distance, the root of the quadric up to which edges collapse: it sums over many planes
 AGGRESSION, LAST_QUADRIC = 5.0, 1e-9 * 102.0**5
-"""Of fast-simplification: its threshold grows with this power of the pass, to this in its last."""
+"""Settings of fast-simplification: its threshold grows with this power of the pass, to this in its last."""
 
 NEAREST = 8  # corners about which triangles are looked at, where those of a place are far
 MOST_ALONE = 40  # corners that are measured from all triangles
@@ -38,7 +38,7 @@ LEVEL = 6  # of gzip's
 
 
 class Packed(NamedTuple):
-    """What the page carries: facts as plain values, and bytes that are unpacked by a script."""
+    """Packed data of the page: facts as plain values, and bytes that are unpacked by a script."""
 
     facts: dict[str, Any]
     content: bytes
@@ -80,24 +80,24 @@ def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, 
         shown, off = [one for one, _ in lighter], ROUNDED * step + max(far for _, far in lighter)
         few = sum(len(one.faces) for one in shown) <= MOST_TRIANGLES
         apart *= 2
-    kept = [(one, part) for one, part in zip(named, shown, strict=True) if part.drawn or (one[2] and len(part.faces))]
-    corners = [_planes(np.diff(part.corners, axis=0, prepend=0).T, 2) for _, part in kept]
+    packed = [(one, part) for one, part in zip(named, shown, strict=True) if part.drawn or (one[2] and len(part.faces))]
+    corners = [_planes(np.diff(part.corners, axis=0, prepend=0).T, 2) for _, part in packed]
     triangles = []
-    for _, part in kept:
+    for _, part in packed:
         index = part.faces.ravel()
         newest = np.maximum.accumulate(np.concatenate([[-1], index[:-1]])) + 1
         triangles.append(_planes(newest - index, 3))  # below the next that no index before had: 0 for a new one
     facts = [
         {"name": one[0], "role": one[1], "closed": one[2]}
         | {"corners": len(part.corners), "triangles": len(part.faces), "drawn": part.drawn}
-        for one, part in kept
+        for one, part in packed
     ]
     content = gzip.compress(b"".join([*corners, *triangles]), LEVEL, mtime=0)
     return Packed({"unit_mm": unit, "off_mm": off, "parts": facts}, content)
 
 
 def _planes(values: Ints, count: int) -> bytes:
-    """The lowest byte of all values, then the next of all: so they pack better."""
+    """Bytes of values, the lowest of all first, then the next of all: so they pack better."""
     return np.ascontiguousarray(values).astype("<i8").view(np.uint8).reshape(-1, 8)[:, :count].T.tobytes()
 
 
@@ -107,66 +107,66 @@ def _lightened(vertices: Floats, faces: Ints32, unit: float, box: Floats, apart_
     for _ in range(TRIES if len(faces) > 1 else 0):
         scale = np.sqrt(LAST_QUADRIC) / (QUADRIC * within)
         smooth = _smoothed(vertices, faces, SMOOTH * within) * scale
-        found, left, collapsed = fast_simplification.simplify(
+        corners, left, collapsed = fast_simplification.simplify(
             smooth, faces, target_count=1, agg=AGGRESSION, return_collapses=True
         )
-        found, place = np.round(found / (scale * unit)) * unit, _places(faces, len(vertices), collapsed)
+        corners, place = np.round(corners / (scale * unit)) * unit, _places(faces, len(vertices), collapsed)
         gone = (place[faces] < 0).all(axis=1)  # an island of few voxels stays as it is
-        off = _farthest(vertices, faces[~gone], found, left, place, box, apart_mm)
+        off = _farthest(vertices, faces[~gone], corners, left, place, box, apart_mm)
         if off <= apart_mm:
-            found, left = np.concatenate([found, vertices]), np.concatenate([left, faces[gone] + len(found)])
+            corners, left = np.concatenate([corners, vertices]), np.concatenate([left, faces[gone] + len(corners)])
             break
         within *= LESS
     else:
-        found, left, off = vertices, faces, 0.0
-    moved, left, drawn = _boxed(found, left, box)
-    return _rounded(moved / unit, left, drawn), max(off, ROUNDED * unit)
+        corners, left, off = vertices, faces, 0.0
+    boxed, left, drawn = _boxed(corners, left, box)
+    return _rounded(boxed / unit, left, drawn), max(off, ROUNDED * unit)
 
 
 def _smoothed(vertices: Floats, faces: Ints32, most_mm: float) -> Floats:
     """Each corner toward the mean of its neighbours, by so much along each axis at most."""
     times = np.maximum(1, 2 * np.bincount(faces.ravel(), minlength=len(vertices)))[:, None]
-    found = vertices
+    smoothed = vertices
     for _ in range(ROUNDS):
-        beside = found[faces[:, [1, 2, 0]]] + found[faces[:, [2, 0, 1]]]
-        sums = [np.bincount(faces.ravel(), beside[..., axis].ravel(), len(vertices)) for axis in range(3)]
-        found = vertices + np.clip(np.stack(sums, axis=1) / times - vertices, -most_mm, most_mm)
-    return found
+        neighbours = smoothed[faces[:, [1, 2, 0]]] + smoothed[faces[:, [2, 0, 1]]]
+        sums = [np.bincount(faces.ravel(), neighbours[..., axis].ravel(), len(vertices)) for axis in range(3)]
+        smoothed = vertices + np.clip(np.stack(sums, axis=1) / times - vertices, -most_mm, most_mm)
+    return smoothed
 
 
 def _places(faces: Ints32, count: int, collapsed: Ints) -> Ints:
-    """Where each corner is among those left, -1 where its triangles are all gone."""
+    """Index of each corner among those left, -1 where its triangles are all gone."""
     root = np.arange(count)
     root[collapsed[:, 1]] = collapsed[:, 0]
     while (root[root] != root).any():
         root = root[root]
-    found = root[faces]
-    left = np.unique(found[(found != np.roll(found, 1, axis=1)).all(axis=1)])
+    corners = root[faces]
+    left = np.unique(corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)])
     place = np.full(count, -1)
     place[left] = np.arange(len(left))
     return place[root]
 
 
 def _farthest(
-    vertices: Floats, faces: Ints32, found: Floats, left: Ints32, place: Ints, box: Floats, near_mm: float
+    vertices: Floats, faces: Ints32, lighter: Floats, left: Ints32, place: Ints, box: Floats, near_mm: float
 ) -> float:
-    """How far corners of either surface are at most from the other, mm, in the box: a bound.
+    """Bound on how far corners of either surface are from the other, mm, in the box.
 
     First they are measured from what came to the place to which they went; those farther than `near_mm` from what is
     about their nearest corners, and few that are left from all.
     """
-    if place.max(initial=-1) + 1 != len(found):
+    if place.max(initial=-1) + 1 != len(lighter):
         return np.inf
-    there, back = np.where(_in(vertices, box), np.inf, 0.0), np.where(_in(found, box), np.inf, 0.0)
+    there, back = np.where(_in(vertices, box), np.inf, 0.0), np.where(_in(lighter, box), np.inf, 0.0)
     ours = np.zeros(len(vertices), bool)
     ours[faces] = True
     there[~ours] = 0.0
     came = faces[(place[faces] >= 0).all(axis=1)]
     rows = np.flatnonzero(np.isinf(there) & (place >= 0))
-    _lower(found, left, vertices, rows, place[rows], there)
-    each = np.arange(len(found))
-    lower_squares(vertices[came], place[came], np.arange(len(found) + 1), each, found, back)
-    for points, squares, corners, triangles in ((vertices, there, found, left), (found, back, vertices, faces)):
+    _lower(lighter, left, vertices, rows, place[rows], there)
+    each = np.arange(len(lighter))
+    lower_squares(vertices[came], place[came], np.arange(len(lighter) + 1), each, lighter, back)
+    for points, squares, corners, triangles in ((vertices, there, lighter, left), (lighter, back, vertices, faces)):
         rows = np.flatnonzero(squares > near_mm**2)
         if len(rows):
             _, nearest = cKDTree(corners).query(points[rows], NEAREST)
@@ -202,8 +202,8 @@ def _boxed(vertices: Floats, faces: Ints32, box: Floats) -> tuple[Floats, Ints32
     exact[faces[reach]] = True
     coarse = np.clip(np.round(vertices / COARSE_MM) * COARSE_MM, *box)
     beyond = np.where(vertices > box[1], box[1] + COARSE_MM, np.where(vertices < box[0], box[0] - COARSE_MM, coarse))
-    moved = np.where(exact[:, None], vertices, beyond)
-    return moved, np.concatenate([faces[reach], faces[~reach]]), int(reach.sum())
+    placed = np.where(exact[:, None], vertices, beyond)
+    return placed, np.concatenate([faces[reach], faces[~reach]]), int(reach.sum())
 
 
 def _rounded(vertices: Floats, faces: Ints32, drawn: int) -> _Part:
@@ -214,10 +214,10 @@ def _rounded(vertices: Floats, faces: Ints32, drawn: int) -> _Part:
     used, index = np.unique(faces, return_inverse=True)
     whole = np.round(vertices[used]).astype(np.int64)
     key = ((whole + (1 << 20)) << np.array([42, 21, 0])).sum(axis=1)  # one number a corner: 21 bits an axis
-    _, same = np.unique(key, return_inverse=True)
-    found = same[index.reshape(-1, 3)]
-    apart = (found != np.roll(found, 1, axis=1)).all(axis=1)
-    near, others = found[:drawn][apart[:drawn]], found[drawn:][apart[drawn:]]
+    _, merged = np.unique(key, return_inverse=True)
+    triangles = merged[index.reshape(-1, 3)]
+    apart = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    near, others = triangles[:drawn][apart[:drawn]], triangles[drawn:][apart[drawn:]]
     _, one, count = np.unique(np.sort(others, axis=1), axis=0, return_index=True, return_counts=True)
     left = np.concatenate([near, others[np.sort(one[count % 2 == 1])]])
     used, first = np.unique(left, return_index=True)
@@ -225,5 +225,5 @@ def _rounded(vertices: Floats, faces: Ints32, drawn: int) -> _Part:
     place = np.zeros(len(whole), np.int64)
     place[used[order]] = np.arange(len(order))
     corner = np.zeros((len(whole), 3), np.int64)
-    corner[same] = whole
+    corner[merged] = whole
     return _Part(corner[used[order]], place[left], len(near))

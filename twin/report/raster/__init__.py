@@ -1,1 +1,1 @@
-"""Pictures without a screen: a camera, triangles to samples, translucent surfaces, shading; compiled."""
+"""Headless rendering: a camera, triangles to samples, translucent surfaces, shading; compiled."""

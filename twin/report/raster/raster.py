@@ -1,4 +1,4 @@
-"""Which triangle every sample of a picture shows: all rays leave one eye, so triangles are drawn, not searched for.
+"""Rasteriser: the triangle in each sample of a picture: all rays leave one eye, so triangles are drawn, not searched.
 
 A sample (x, y) looks along d = (x, y, 1) in the camera's frame (right, up, forward). The ray meets the plane of the
 triangle a, b, c at 1/z = d.((b - a) x (c - a)) / a.(b x c), and lies inside where d.(b x c), d.(c x a) and d.(a x b)
@@ -170,7 +170,7 @@ def _edges(a, b, c):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _at(plane, x, y):
-    """How far a ray (x, y, 1) leads to the side of a plane through the eye."""
+    """Component of a ray (x, y, 1) along the normal of a plane through the eye."""
     return plane[0] * x + (plane[1] * y + plane[2])
 
 

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def"
-"""Pictures without a screen: triangles drawn into a sample grid with depth, and shaded, by compiled code.
+"""Headless renderer: triangles drawn into a sample grid with depth, and shaded, by compiled code.
 
 Opaque surfaces give one hit per sample; translucent ones (skin, corridor) are seen through, with up to ``MAX_SHELLS``.
 A film keeps the triangles that its samples show of what stands still, and draws what moves over them. Pixels are lit,
@@ -66,18 +66,18 @@ class Layer:
 
     @cached_property
     def normals(self) -> Floats32:
-        """Of the corners, shape (n, 3)."""
+        """Unit normals of the corners, shape (n, 3)."""
         return np.asarray(raster.corner_normals(self.vertices, self.faces))
 
     def sees(self, eye: Floats, points: Floats) -> Bools:
         """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
-        way = points - eye
-        far = np.linalg.norm(way, axis=1)
+        ray = points - eye
+        far = np.linalg.norm(ray, axis=1)
         nearest = np.full(len(points), np.inf)
         for surface in self.surfaces:
-            found = crossings(surface.mesh, eye, way / far[:, None], float(far.max()))
-            hit = found.count > 0
-            nearest[hit] = np.minimum(nearest[hit], found.depth[found.first[hit]])
+            hits = crossings(surface.mesh, eye, ray / far[:, None], float(far.max()))
+            hit = hits.count > 0
+            nearest[hit] = np.minimum(nearest[hit], hits.depth[hits.first[hit]])
         return np.asarray(nearest >= far - LINE_OF_SIGHT_SLACK_MM)
 
 
@@ -88,7 +88,7 @@ class Drawn(NamedTuple):
     triangle: Ints32
 
     def part(self, where: tuple[slice, slice, slice]) -> Drawn:
-        """A copy of rows and columns of it."""
+        """A copy of some rows and columns."""
         return Drawn(self.inverse[where].copy(), self.triangle[where].copy())
 
     @staticmethod
@@ -99,7 +99,7 @@ class Drawn(NamedTuple):
 
     @staticmethod
     def empty(most: int, shape: tuple[int, ...]) -> Drawn:
-        """Nothing is drawn yet; at most so many surfaces a sample."""
+        """Samples in which nothing is drawn yet, for at most so many surfaces each."""
         return Drawn(np.zeros((most, *shape), dtype=np.float32), np.full((most, *shape), -1, dtype=np.int32))
 
 
@@ -116,7 +116,7 @@ class Look(NamedTuple):
     rims: Floats32  # shape (b,), how much more opaque where one sees them edge-on
 
     def with_more(self, other: Look) -> Look:
-        """Both; of two in one place the bodies of this one are seen."""
+        """Both looks as one; of two bodies in one place those of this one are seen."""
         faces, bodies = other.faces + np.int32(len(self.points)), other.bodies + np.int32(len(self.colours))
         parts: Any = zip(self, other._replace(faces=faces, bodies=bodies), strict=True)
         return Look(*(np.concatenate(both) for both in parts))
@@ -129,12 +129,12 @@ class View:
     """
 
     def __init__(self, layer: Layer, camera: ViewCamera, T_ct_layer: Floats | None = None) -> None:
-        turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
+        rotation, eye = camera.axes, np.asarray(camera.eye, dtype=float)
         if T_ct_layer is not None:
-            turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
+            rotation, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
         self.grid = camera.scale, camera.height, camera.width
-        points = raster.rotated(layer.vertices, turn, eye)
-        normals, flats = raster.rotated(layer.normals, turn, np.zeros(3)), raster.flat_normals(points, layer.faces)
+        points = raster.rotated(layer.vertices, rotation, eye)
+        normals, flats = raster.rotated(layer.normals, rotation, np.zeros(3)), raster.flat_normals(points, layer.faces)
         look = layer.faces, layer.bodies, normals, flats, layer.colours, layer.alphas, layer.rims
         self.look = Look(points, *look)
         self.spans: Ints32 = raster.outlines(points, layer.faces, self.grid)
@@ -172,8 +172,8 @@ def _finished(
 ) -> Pixels:
     """The pixels (h, w, 3) of a part of a picture, from the triangles that its samples show."""
     held = np.zeros((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)  # what is not there is blended at 0
-    high, wide = behind.triangle.shape[1:]
-    pixels = np.empty((high // SAMPLES, wide // SAMPLES, 3), dtype=np.uint8)
+    height, width = behind.triangle.shape[1:]
+    pixels = np.empty((height // SAMPLES, width // SAMPLES, 3), dtype=np.uint8)
     place: Any = tuple(LIGHT), grid, corner, behind.triangle, shells, tuple(BACKGROUND)
     finish(tuple(solid), tuple(glass), *place, held, pixels)
     return pixels
@@ -193,7 +193,7 @@ def _joined(arrays: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
 
 
 class MovingPicture:
-    """One view of what stands still, CT frame, with bodies that move; several threads may ask it at once.
+    """One view of a still scene, CT frame, with bodies that move; several threads may use it at once.
 
     Each layer moves in its own frame. Of two in one place the first is seen, and what stands before all.
     """

@@ -54,7 +54,7 @@ QUALITY = ("-crf", "20", "-preset", "veryfast", "-movflags", "+faststart")
 
 @dataclass(frozen=True)
 class FilmTimes:
-    """When each frame is taken: moments of the rehearsal in s, the playback speed, and how many frames stand still."""
+    """Times of the frames: moments of the rehearsal in s, the playback speed, and how many frames stand still."""
 
     moments: tuple[float, ...]
     speed: float
@@ -62,12 +62,12 @@ class FilmTimes:
 
     @property
     def frames(self) -> int:
-        """All frames of the film."""
+        """Number of frames of the film."""
         return len(self.moments) + self.still_frames
 
     @property
     def duration_s(self) -> float:
-        """Of the film."""
+        """Duration of the film."""
         return self.frames / FRAMES_PER_SECOND
 
 
@@ -95,17 +95,17 @@ def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path) ->
 
 
 class _Film(NamedTuple):
-    """The two views, with the links after the base and the tool, and with the tool alone, and the words about them."""
+    """The two views of a film, with the moving links and the tool, and with the tool alone, and the text about them."""
 
     wide: MovingPicture
     near: MovingPicture
     words: FilmFrames
     poses: Callable[[int], list[Floats]]
-    """Of the links after the base, and the tool, T_ct_body, at a record of the rehearsal."""
+    """T_ct_body of the links after the base, and of the tool, at a record of the rehearsal."""
 
     @classmethod
     def of(cls, rehearsal: Any, plan: Any, case: Any, anatomy: Any, speed: float) -> _Film:
-        """What does not move is drawn here, once."""
+        """The film of a rehearsal, with what does not move drawn once."""
         T_base_ct = rehearsal.T_base_ct_true
         arm = ArmPicture(plan.model, T_base_ct)
         base, at_standoff = arm.bodies(rehearsal.q[0])[0], plan.target_ct + plan.standoff_mm * plan.outward_ct
@@ -161,7 +161,7 @@ def _tool_layer(case: Any, camera: ViewCamera) -> Layer:
 
 
 def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: Any, plan: Any) -> ViewCamera:
-    """The patient fills the picture, seen from the entry's side, with the needle at its standoff."""
+    """Camera of the overview: the patient fills it, seen from the entry's side, with the needle at its standoff."""
     direction = plan.outward_ct
     focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * direction
     shown = focus[np.linalg.norm(focus - plan.target_ct, axis=1) < plan.standoff_mm + ABOVE_MM]
@@ -245,7 +245,7 @@ class FilmFrames:
         return int(np.searchsorted(self._rehearsal.times_s, moment, side="right")) - 1
 
     def _news(self, draw: ImageDraw.ImageDraw, moment: float) -> None:
-        """Over the overview: what touches while that is news, and at the end the result."""
+        """Write recent contacts over the overview, and at the end the result."""
         done = self._rehearsal
         fresh = [contact for contact in done.contacts if 0.0 <= moment - contact.time_s <= CONTACT_SHOWN_S]
         for line, contact in enumerate(fresh[-3:]):
@@ -258,7 +258,7 @@ class FilmFrames:
             annotate.write(draw, (12, self._wide.height - 34), said, size=20, bold=True, colour=ink, halo=4)
 
     def _numbers(self, draw: ImageDraw.ImageDraw, top: int, row: int, moment: float) -> None:
-        """Below the views: the numbers of a record; at the end what the tip's error consists of."""
+        """Write the numbers of a record below the views; at the end what the tip's error consists of."""
         done = self._rehearsal
         contacts = sum(one.time_s <= moment for one in done.contacts)
         phase, away = str(done.phase[row]), float(np.linalg.norm(done.tip_true_ct[row] - done.target_true_ct))
@@ -323,7 +323,7 @@ def _over_near(near: ViewCamera, case: Any) -> Image.Image:
 
 
 def model_note(case: Any) -> str:
-    """What a film shows of needle, tissue and breath: what the case declares of them is computed, not drawn."""
+    """Note on needle, tissue and breath: what the case declares of them is computed, not drawn."""
     needle = "needle and tissue are rigid"
     if case.bending is not None:
         needle = "tissue pushes on the needle: its end is bent, the drawing is straight"

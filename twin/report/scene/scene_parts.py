@@ -57,7 +57,7 @@ def ring(T_ct_ring: Floats, inner: float, outer: float, thickness: float) -> Tri
 
 
 def corridor(candidates: Candidates, case: Any) -> list[TriangleMesh]:
-    """Where a needle may enter: a patch of the skin for every safe cell of the grid, and the walls from there.
+    """The corridor of safe directions: a patch of the skin for every safe cell of the grid, and the walls from there.
 
     These are triangles from the target to the rim of the patches. Nothing where nothing is safe; no walls where all is.
     """
@@ -133,7 +133,7 @@ LEAST_NEEDLE_MM = 1.0  # least radius that is drawn: thinner is below a pixel. T
 
 @dataclass(frozen=True, eq=False)
 class SceneBody:
-    """One thing of the scene."""
+    """One coloured body of the scene."""
 
     name: str
     group: str  # "organ", "skin", "safe", "needle", "arm", "room" or "target"
@@ -144,7 +144,7 @@ class SceneBody:
 
     @property
     def surface(self) -> Surface:
-        """For the ray caster; the corridor is flat colour, without the rim that makes a skin look like glass."""
+        """Surface to draw; the corridor is flat colour, without the rim that makes a skin look like glass."""
         rim = 0.0 if self.group == "safe" else Surface.rim
         return Surface(self.mesh, self.colour, self.alpha, rim)
 
@@ -295,7 +295,7 @@ class Scene:
 
     @property
     def needle(self) -> tuple[SceneBody, ...]:
-        """On the target; nothing without a direction."""
+        """The needle on the target; nothing without a direction."""
         return () if self.outward_ct is None else needle_bodies(self.case.needle, self.case.target_ct, self.outward_ct)
 
     @property

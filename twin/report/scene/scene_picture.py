@@ -120,7 +120,7 @@ def _empty_corner(seen: NDArray[np.uint8], box: Box, on_needle: Floats) -> tuple
 
 
 def _text(draw: ImageDraw.ImageDraw, scene: Scene, bodies: Sequence[SceneBody], *, arm: bool) -> float:
-    """Everything around the views; returns the row below the legend."""
+    """Write the text around the views; returns the row below the legend."""
     case, candidates, plan = scene.case, scene.candidates, scene.plan
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_text(case)}", size=28, bold=True)
     nothing = scene.chosen is None and plan is None

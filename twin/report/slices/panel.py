@@ -37,7 +37,7 @@ BESIDE: dict[str, tuple[str, Rgb]] = {  # of an image alone: what no structure n
 
 
 class Near(NamedTuple):
-    """A structure near the needle."""
+    """A structure near the needle: name, colour, clearance and margin."""
 
     name: str
     colour: Rgb
@@ -53,7 +53,7 @@ class Near(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """One direction, as the slices show it."""
+    """A direction or an image, as the slices show it."""
 
     case: Any
     anatomy: Any
@@ -70,7 +70,7 @@ class Subject:
 
     @property
     def path_mm(self) -> float:
-        """Target to skin, NaN without an entry."""
+        """Path from target to skin, mm, NaN without an entry."""
         return float("nan") if self.pick is None else float(self.pick.candidates.path.length[self.pick.row])
 
     @cached_property
@@ -92,7 +92,7 @@ class Subject:
 
     @property
     def beside(self) -> list[tuple[str, Rgb]]:
-        """Of an image alone, what was found that no structure names: for a legend."""
+        """Findings of an image alone that no structure names, for a legend."""
         names = {one.name for one in self.anatomy.checked}
         return [] if self.pick is not None else [line for name, line in BESIDE.items() if name in names]
 
@@ -100,8 +100,8 @@ class Subject:
     def _demanding(self) -> tuple[Near, ...]:
         if self.pick is None:
             return ()
-        found, row = self.pick.candidates.clearance, self.pick.row
-        rows = zip(found.structures, found.by_structure[row].tolist(), found.margins.tolist(), strict=True)
+        clearance, row = self.pick.candidates.clearance, self.pick.row
+        rows = zip(clearance.structures, clearance.by_structure[row].tolist(), clearance.margins.tolist(), strict=True)
         near = (Near(name, self.colours.get(name, OUTSIDE), mm, margin) for name, mm, margin in rows)
         return tuple(sorted((one for one in near if np.isfinite(one.margin_mm)), key=lambda one: one.clearance_mm))
 
@@ -116,8 +116,8 @@ class Subject:
         if self.case.bending is None or not np.isfinite(self.path_mm):
             return None
         where = self.case.target_ct, self.outward_ct, self.path_mm
-        found = insertion_along(self.case.bending, self.anatomy, *where).path
-        return np.stack([self.path_mm - found.depth_mm, found.needle_mm], axis=1)
+        shaft = insertion_along(self.case.bending, self.anatomy, *where).path
+        return np.stack([self.path_mm - shaft.depth_mm, shaft.needle_mm], axis=1)
 
     @property
     def title(self) -> str:
@@ -174,7 +174,7 @@ def draw_panel(subject: Subject, plane: Plane) -> Panel:
 
 
 def leaning(subject: Subject, plane: Plane) -> str:
-    """How a needle lies to a plane; "" without one, and where it has no entry."""
+    """Text of the needle's angle to a plane; "" without one, and where it has no entry."""
     if subject.pick is None or not np.isfinite(subject.path_mm):
         return ""
     lean = float(subject.outward_ct @ plane.normal)
@@ -244,7 +244,7 @@ def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
 
 
 def _bent(axes: Axes, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
-    """Where the bevel may take the needle: its line to both sides, or how far off the axis it may be at the plane."""
+    """Draw where the bevel may take the needle: its line to both sides, or how far off the axis it may be there."""
     outward, off = subject.outward_ct, abs(float(bent_mm[-1, 1]))
     if abs(float(outward @ plane.normal)) > IN_PLANE:
         if off > 0:
@@ -256,7 +256,7 @@ def _bent(axes: Axes, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
 
 
 def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
-    """What lies beyond each edge of the picture; beside the needle where it leaves the picture there."""
+    """Write the body's direction beyond each edge; beside the needle where it leaves the picture there."""
     middle, far = PIXELS / 2, PIXELS - EDGE
     edges = (
         (far, middle, plane.right, "right", "center"),
@@ -268,16 +268,16 @@ def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
     needle = np.linspace(0, 1, PIXELS)[:, None] * plane.place(plane.at_ct + shaft)
     needle = ((needle - plane.centre) / plane.half_mm + 1) * middle  # pixels to the right and up
     for x, y, direction, ha, va in edges:
-        beside = va == "center"
+        at_side = va == "center"
         near = needle[np.linalg.norm(needle - (x, y), axis=1) < 2 * CLEAR]
-        off = 0.0 if len(near) == 0 else float(near[:, int(beside)].mean()) - middle
+        off = 0.0 if len(near) == 0 else float(near[:, int(at_side)].mean()) - middle
         shift = 0.0 if len(near) == 0 or abs(off) > CLEAR else off + (-CLEAR if off > 0 else CLEAR)
-        at = (x, y + shift) if beside else (x + shift, y)
+        at = (x, y + shift) if at_side else (x + shift, y)
         _write(axes, at, letters(subject.case.space, direction), LETTERS, ha=ha, va=va, weight="bold")
 
 
 def _write(axes: Axes, at: tuple[float, float], text: str, size: float, **look: Any) -> None:
-    """White words with a black rim at pixels to the right and up of the lower left corner."""
+    """Write white text with a black rim at pixels to the right and up of the lower left corner."""
     axes.text(*at, text, fontsize=size, color="white", path_effects=LETTERS_RIM, transform=None, **look)
 
 
@@ -294,7 +294,7 @@ class Tone(NamedTuple):
 
 
 TONES = {"abdomen": Tone(40, 400), "lung": Tone(-600, 1500), "bone": Tone(400, 1800), "brain": Tone(40, 80)}
-"""As on the consoles of scanners."""
+"""Windows of the CT, as on the consoles of scanners."""
 
 KNOTS_HU = (-1350.0, -160.0, 0.0, 80.0, 240.0, 1300.0)
 KNOTS_BYTE = (0.0, 48.0, 96.0, 152.0, 208.0, 255.0)

@@ -1,4 +1,4 @@
-"""The planes in which a needle's path or an image is looked at, and where each cuts surfaces, needle and tip region."""
+"""The planes of slices of a needle's path or an image, and their cuts of surfaces, needle and tip region."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +21,7 @@ CAPSULE_POINTS, ELLIPSE_POINTS = 181, 121  # on each of a capsule's two sides; a
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """One square picture."""
+    """The plane of one square picture."""
 
     name: str
     at_ct: Floats  # shape (3,), a point of the plane, the target
@@ -110,20 +110,20 @@ def _unit(vector: Floats) -> Floats:
 
 
 def letters(space: str, direction: Floats) -> str:
-    """What lies in a direction (3,), unit: R, L, A, P, H, F, two of them where it is oblique; axes of a local frame."""
+    """Letters of a direction (3,), unit: R, L, A, P, H, F, two of them where it is oblique; axes of a local frame."""
     return " ".join(LETTERS.get(name, name) for name in _named(space, direction))
 
 
 def toward_text(space: str, direction: Floats) -> str:
-    """The same in words, such as "toward the feet" or "to the patient's left and toward the back"."""
+    """A direction (3,) in words, such as "toward the feet" or "to the patient's left and toward the back"."""
     side = {"patient's left": "to the patient's left", "patient's right": "to the patient's right"}
     along = {name: f"toward the {name}" for name in ("back", "front", "head", "feet")}
     return " and ".join((side | along).get(name, f"along {name}") for name in _named(space, direction))
 
 
 def _named(space: str, direction: Floats) -> list[str]:
-    found = sorted(body_directions(space).items(), key=lambda item: -float(item[1] @ direction))
-    return [name for name, vector in found[:2] if vector @ direction > OBLIQUE]
+    directions = sorted(body_directions(space).items(), key=lambda item: -float(item[1] @ direction))
+    return [name for name, vector in directions[:2] if vector @ direction > OBLIQUE]
 
 
 def outline(mesh: TriangleMesh, plane: Plane) -> Floats:

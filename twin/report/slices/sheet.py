@@ -59,7 +59,7 @@ class Slices:
 
     @property
     def legend(self) -> list[tuple[str, Rgb]]:
-        """Names with colours."""
+        """Names of the legend with their colours."""
         subject = self.subject
         target = subject.case.target_structure
         needle = [] if subject.pick is None else [("needle", NEEDLE_COLOUR)]
@@ -70,7 +70,7 @@ class Slices:
 
 
 def draw_slices(subject: Subject) -> Slices:
-    """Draw all of one direction, or of the image alone."""
+    """The slices of one direction, or of the image alone."""
     target = subject.case.target_ct
     if subject.pick is None:
         shown = planes.body_planes(target, subject.anatomy.skin.mesh.bounds)
@@ -93,7 +93,7 @@ LETTERS, LEAST_LETTERS = 11.0, 8.0  # pixels: names of many structures are small
 
 
 def _hu_plot(subject: Subject) -> Image.Image | None:
-    """The picture; None in a case without CT, and for a direction without an entry."""
+    """Plot of Hounsfield units along the needle; None in a case without CT, and for a direction without an entry."""
     parts = stretches(subject.anatomy, subject.case.target_ct, subject.outward_ct, subject.path_mm)
     if not parts:
         return None

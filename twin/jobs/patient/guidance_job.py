@@ -24,7 +24,7 @@ from puncture_twin.planning.search.uncertainty_breakdown import LEAST_FRACTION
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.jobs.patient.main_job import checked_plan, is_plan, plan_case
-from puncture_twin.twin.jobs.patient.run import plan_summary, trial_failures, writing_of
+from puncture_twin.twin.jobs.patient.run import case_draft, plan_summary, trial_failures
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.report import present
@@ -32,30 +32,30 @@ from puncture_twin.twin.report.error_pictures import ALONE, BETTER, WORSE, draw_
 from puncture_twin.twin.report.present import Card, Field, Section, Table, Warn, grid, number, percent
 
 PAGE, PICTURE, TABLE = FILES = ("ways.html", "ways.png", "ways.json")
-SAME = "one plan, the same patients for every way."
+SAME_PATIENTS = "one plan, the same patients for every way."
 CLEAR = 2.0  # standard errors of a difference that make it clear
 LOOK_S = {"camera_pairs": 5.0, "pictures": 30.0}  # of a look; assumed: a program reads cameras, a person a picture
 COLOURS = {"best": BETTER, "as good": ALONE, "worse": WORSE}
 
 
 class Rated(NamedTuple):
-    """One way beside the best: best, as good or worse, and in what; `failed` is the fraction of all trials."""
+    """A guidance and its rating: best, as good or worse, and in what; `failed` is the fraction of all trials."""
 
-    found: Distribution
+    distribution: Distribution
     failed: float
     rating: str
     why: str
 
 
-def rated(found: list[Distribution]) -> tuple[Rated, ...]:
-    """Ways with the same number of trials each, the best first."""
-    count = len(found[0]) + found[0].stopped + found[0].unreached
-    failed = np.array([1.0 - float((one.hit & ~one.touched.any(axis=1)).sum()) / count for one in found])
+def rated(distributions: list[Distribution]) -> tuple[Rated, ...]:
+    """Guidances with the same number of trials each, rated, the best first."""
+    count = len(distributions[0]) + distributions[0].stopped + distributions[0].unreached
+    failed = np.array([1.0 - float((one.hit & ~one.touched.any(axis=1)).sum()) / count for one in distributions])
     variance = failed * (1.0 - failed) / count
     least = int(failed.argmin())
     fails = failed > failed[least] + CLEAR * np.sqrt(variance + variance[least])
-    square = np.array([np.mean(one.tip_error_mm**2) if len(one) else np.inf for one in found])
-    spread = np.array([np.std(one.tip_error_mm**2) / np.sqrt(len(one)) if len(one) else 0.0 for one in found])
+    square = np.array([np.mean(one.tip_error_mm**2) if len(one) else np.inf for one in distributions])
+    spread = np.array([np.std(one.tip_error_mm**2) / np.sqrt(len(one)) if len(one) else 0.0 for one in distributions])
     first, *_ = order = np.lexsort((square, fails)).tolist()
     larger = np.isfinite(square) & (square > square[first] + CLEAR * np.hypot(spread, spread[first]))
     rows = []
@@ -63,38 +63,38 @@ def rated(found: list[Distribution]) -> tuple[Rated, ...]:
         times = f"error ×{number(np.sqrt(square[row] / square[first]), 2)}" if larger[row] else ""
         why = ", ".join(filter(None, ("more trials fail" if fails[row] else "", times)))
         rating = "best" if row == first else "worse" if why else "as good"
-        rows.append(Rated(found[row], float(failed[row]), rating, why))
+        rows.append(Rated(distributions[row], float(failed[row]), rating, why))
     return tuple(rows)
 
 
 @dataclass(frozen=True)
 class Compared:
-    """Ways of guidance along one plan, the best first; those without an answer, and why; files written, files read."""
+    """Guidances along one plan, the best first; those without an answer, and why; files written, files read."""
 
     context: CaseContext
     plan: Plan
-    ways: tuple[Rated, ...]
+    ranked: tuple[Rated, ...]
     unknown: Mapping[str, str]
     read: tuple[Input, ...]
     files: tuple[Path, ...] = ()
 
     def failures(self, one: Rated) -> list[str]:
-        """Where more of a way's trials missed or touched than the case allows."""
-        return list(trial_failures(self.context.case, one.found))
+        """Where more of a guidance's trials missed or touched than the case allows."""
+        return list(trial_failures(self.context.case, one.distribution))
 
     @property
     def passed(self) -> bool:
-        """Whether one way at least keeps to what the case allows."""
-        return not all(map(self.failures, self.ways))
+        """Whether one guidance at least keeps to what the case allows."""
+        return not all(map(self.failures, self.ranked))
 
     def rows(self) -> list[dict[str, Any]]:
-        """Each way as `rehearse --json` has its distribution; how it is beside the best, and how long it takes."""
+        """Each guidance as `rehearse --json` has its distribution, compared with the best, and its time."""
         moving = self.plan.approach.duration_s + self.plan.insertion.duration_s
-        looks = [sum(seconds * one.found.looks[kind] for kind, seconds in LOOK_S.items()) for one in self.ways]
+        looks = [sum(seconds * one.distribution.looks[kind] for kind, seconds in LOOK_S.items()) for one in self.ranked]
         return [
-            {**one.found.summary(), "rating": one.rating, "worse_in": one.why, "failed_share": one.failed,
+            {**one.distribution.summary(), "rating": one.rating, "worse_in": one.why, "failed_share": one.failed,
              "seconds": moving + seconds, "failures": self.failures(one)}
-            for one, seconds in zip(self.ways, looks, strict=True)
+            for one, seconds in zip(self.ranked, looks, strict=True)
         ]  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -103,7 +103,7 @@ class Compared:
             **self.context.provenance(),
             "inputs": inputs_document((*self.read, *self.context.case.inputs)),
             "plan": plan_summary(self.plan),
-            "ways": [*self.rows(), *({"guidance": way, "no_answer": why} for way, why in self.unknown.items())],
+            "ways": [*self.rows(), *({"guidance": name, "no_answer": why} for name, why in self.unknown.items())],
             "assumed_look_s": dict(LOOK_S),
             "files": [str(path) for path in self.files],
         }
@@ -113,7 +113,7 @@ class Compared:
         rows = self.rows()
         first, patients = rows[0], plural(rows[0]["rooms"], "patient")
         lost = [f"{row['guidance']}: {one}" for row in rows for one in (*row["failures"], *row["lost_sight"])]
-        lost += [f"{way}: {why}" for way, why in self.unknown.items()]
+        lost += [f"{guidance}: {why}" for guidance, why in self.unknown.items()]
         said = [f"Not modelled: {first['not_modelled']}."]
         said += dict.fromkeys(one for row in rows for one in row["assumed"])
         said += [f"The needle pushes the target on by {first['pushed_mm']:.2f} mm."] if "pushed_mm" in first else []
@@ -128,45 +128,45 @@ class Compared:
         ]
 
     def _sources(self) -> Table:
-        budgets = [one.found.budget for one in self.ways]
+        budgets = [one.distribution.budget for one in self.ranked]
         names = {name for one in budgets for name, part in one.fraction.items() if part >= LEAST_FRACTION}
         parts = {name: [np.sqrt(one.fraction.get(name, 0.0)) * one.rms_mm for one in budgets] for name in names}
         order = sorted(names, key=lambda name: (-max(parts[name]), name))
         shown = [*((SOURCES[name].text, parts[name]) for name in order), ("all", [one.rms_mm for one in budgets])]
         rows = tuple((text, *(number(part, 2) for part in row)) for text, row in shown)
-        return Table(("source", *(str(one.found.guidance) for one in self.ways)), rows)
+        return Table(("source", *(str(one.distribution.guidance) for one in self.ranked)), rows)
 
     def text(self) -> str:
         """What a person reads."""
         title = Section(
-            f"case {self.context.case.name}, θ {self.plan.theta_deg:g}°, β {self.plan.beta_deg:g}°: {SAME}", []
+            f"case {self.context.case.name}, θ {self.plan.theta_deg:g}°, β {self.plan.beta_deg:g}°: {SAME_PATIENTS}", []
         )
         return present.text([title, *self.sections(), *present.footer(self.files, self.context.anatomy.warnings)])
 
     def write(self, folder: Path) -> None:
         """Write page and picture."""
-        shown = [(one.found, one.rating, COLOURS[one.rating]) for one in self.ways]
+        shown = [(one.distribution, one.rating, COLOURS[one.rating]) for one in self.ranked]
         draw_clouds(shown, self.plan.outward_ct, folder / PICTURE, self.context.case.hit_radius_mm)
         cards = [
-            Card(f"{one.found.guidance}: {one.rating}", number(one.found.realised_rms_mm, 2, "mm rms"),
+            Card(f"{one.distribution.guidance}: {one.rating}", number(one.distribution.realised_rms_mm, 2, "mm rms"),
                  f"{percent(1 - one.failed)} of all trials hit and touched nothing",
                  one.rating == "worse" or bool(self.failures(one)))
-            for one in self.ways
+            for one in self.ranked
         ]  # fmt: skip
         clouds = present.picture(folder / PICTURE, "error clouds of each way of guidance")
         first, *rest = self.sections()
         sections = [first, Section("where the tip ended", [clouds, CLOUD_TEXT]), *rest]
-        inputs, origin = (*self.read, *self.context.case.inputs), present.origin_section(self.ways[0].found.seed)
+        inputs, seed = (*self.read, *self.context.case.inputs), self.ranked[0].distribution.seed
         title = f"Ways of guidance of {self.context.case.name}"
-        under = f"θ {self.plan.theta_deg:g}°, β {self.plan.beta_deg:g}°: {SAME}"
-        present.write_page(folder / PAGE, title, under, cards, sections, inputs, origin=origin)
+        under = f"θ {self.plan.theta_deg:g}°, β {self.plan.beta_deg:g}°: {SAME_PATIENTS}"
+        present.write_page(folder / PAGE, title, under, cards, sections, inputs, origin=present.origin_section(seed))
 
 
 def _rating(row: Mapping[str, Any]) -> str:
     return Markup('<b class="bad">worse: {}</b>').format(row["worse_in"]) if row["rating"] == "worse" else row["rating"]
 
 
-def _share(name: str, key: str) -> Field:
+def _part(name: str, key: str) -> Field:
     return Field(name, lambda row: None if row[key] is None else percent(row[key]))
 
 
@@ -178,9 +178,9 @@ def _devices(row: Mapping[str, Any]) -> str:
 OUTCOME = (
     Field("guidance", "guidance"), Field("against the best", _rating),
     Field("tip error (rms)", "realised_rms_mm", 2, "mm"), Field("predicted", "predicted_rms_mm", 2, "mm"),
-    _share("in the 95 % region", "coverage_95"), _share("hits", "hit_share"), _share("predicted hits", "mean_p_hit"),
-    _share("touches", "touch_share"), _share("predicted touches", "mean_p_touch"), Field("stopped", "stopped"),
-    Field("out of reach", "unreached"), _share("failed of all", "failed_share"),
+    _part("in the 95 % region", "coverage_95"), _part("hits", "hit_share"), _part("predicted hits", "mean_p_hit"),
+    _part("touches", "touch_share"), _part("predicted touches", "mean_p_touch"), Field("stopped", "stopped"),
+    Field("out of reach", "unreached"), _part("failed of all", "failed_share"),
 )  # fmt: skip
 WORSE_TEXT = (
     "Worse: clearly more of all trials fail (stopped, out of reach, missed or touched), or the error is clearly "
@@ -216,10 +216,10 @@ HAND_TEXT = (
 )
 
 
-def ways_job(
-    context: CaseContext, source: Path, out: Path, ways: tuple[str, ...], count: int, choice: Choice
+def compare_guidance(
+    context: CaseContext, source: Path, out: Path, guidances: tuple[str, ...], count: int, choice: Choice
 ) -> Compared:
-    """Compare ways of guidance along a plan, or along a case's best or chosen direction; write page and picture."""
+    """Compare guidances along a plan, or along a case's best or chosen direction; write page and picture."""
     started, planned = None, tuple[Path, ...]()
     if is_plan(source):
         started, plan, _ = checked_plan(context, source)
@@ -228,8 +228,8 @@ def ways_job(
         run = plan_case(context, out, choice)
         assert run.plan is not None  # else it has raised
         plan, read, planned = run.plan, run.read, run.files
-    with writing_of(context, out, "rehearse", FILES, read, started) as draft:
-        done = Compared(context, plan, *_rehearsed(context, plan, ways, count), read)
+    with case_draft(context, out, "rehearse", FILES, read, started) as draft:
+        done = Compared(context, plan, *_rehearsed(context, plan, guidances, count), read)
         done.write(draft.folder)
         done = replace(done, files=(*planned, *draft.final(tuple(draft.folder / name for name in FILES))))
         write_result(done.summary(), draft.folder / TABLE, out)
@@ -237,19 +237,19 @@ def ways_job(
 
 
 def _rehearsed(
-    context: CaseContext, plan: Plan, ways: tuple[str, ...], count: int
+    context: CaseContext, plan: Plan, guidances: tuple[str, ...], count: int
 ) -> tuple[tuple[Rated, ...], dict[str, str]]:
-    found, unknown, case = list[Distribution](), dict[str, str](), context.case
-    for way in ways:
-        case, _ = equipped(case, way)
+    distributions, unknown, case = list[Distribution](), dict[str, str](), context.case
+    for guidance in guidances:
+        case, _ = equipped(case, guidance)
     with context.stages.time("rooms"):
-        sight = sight_of(replace(context, case=case), plan, *ways)
+        sight_line = sight_of(replace(context, case=case), plan, *guidances)
         seed, q = context.case.rehearsal.seed, plan.insertion.q[-1]
-        for way in ways:
+        for guidance in guidances:
             try:
-                found.append(rehearse_trials(context, plan.outward_ct, q, count, seed, way, sight))
+                distributions.append(rehearse_trials(context, plan.outward_ct, q, count, seed, guidance, sight_line))
             except NoAnswerError as error:
-                unknown[way] = str(error)
-    if not found:
+                unknown[guidance] = str(error)
+    if not distributions:
         raise NoAnswerError("; ".join(unknown.values()), code="lost_sight")
-    return rated(found), unknown
+    return rated(distributions), unknown
