@@ -195,9 +195,9 @@ def check(
     from puncture_twin.planning.budget.guidance import explained_ways
     from puncture_twin.planning.search.choice import explain_choice
     from puncture_twin.planning.search.explain import NEAREST
-    from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
+    from puncture_twin.twin.jobs.choosing.list_job import check_list, checks_list
 
-    if lists_of(entries, targets, choice, picture=picture, out_dir=out_dir):
+    if checks_list(entries, targets, choice, picture=picture, out_dir=out_dir):
         with progress_display() as progress:
             listed = check_list(case, entries, targets, choice, out_dir=out_dir, arm=arm, watcher=progress)
         finish("check", listed, listed.summary(), listed.text(), as_json)
@@ -315,7 +315,7 @@ def markers(
     """Find the markers on the skin of a CT, or propose places for them. Writes their list for case and Slicer."""
     from puncture_twin.twin.jobs.patient import markers_job
 
-    stated = markers_job.stated_of(kind, diameter, count, layout, propose)
+    stated = markers_job.stated_markers(kind, diameter, count, layout, propose)
     folder = out_folder(out_dir, source, "markers")
     if propose is not None:
         with prepared(source) as context:
@@ -340,9 +340,9 @@ def touch(
     """Plan the marker touches and execute them in the twin, or read a UR's. Writes touch.csv. Exit 1 on too few."""
     if host is not None:
         from puncture_twin.planning.case.case import load_case
-        from puncture_twin.twin.jobs.live.mirror import LedArm, connect, led_text, refuse_of_twin, touch_by_hand
+        from puncture_twin.twin.jobs.live.mirror import LedArm, connect, led_text, refuse_twin_options, touch_by_hand
 
-        refuse_of_twin(choice, seed)
+        refuse_twin_options(choice, seed)
         loaded, arm = load_case(case), LedArm(connect(host, "touch --host"))
         read = touch_by_hand(loaded, arm, _led_to, out_folder(out_dir, case, "touch"))
         finish("touch", read, read.summary(), led_text(read), as_json)
@@ -384,7 +384,7 @@ def pivot(
     from puncture_twin.twin.jobs.experiment import pivot_job
 
     if joints is not None:
-        pivot_job.refuse_of_twin(out_dir, poses, at, seed)
+        pivot_job.refuse_twin_options(out_dir, poses, at, seed)
         read = pivot_job.pivot_case(load_case(case), joints)
         finish("pivot", read, read.summary(), pivot_job.pivot_text(read), as_json)
         return

@@ -645,10 +645,10 @@ def place(context: CaseContext, *, jobs: int = 2, quick_s: float | None = None) 
     Raises:
         NoAnswerError: No direction is safe for the organs, or the arm reaches none from any placement.
     """
-    from puncture_twin.twin.jobs.patient.place_job import find_places, refuse_none
+    from puncture_twin.twin.jobs.patient.place_job import find_places, refuse_unreached
 
     found = find_places(context, jobs, math.inf if quick_s is None else time.perf_counter() + quick_s).search
-    refuse_none(found)
+    refuse_unreached(found)
     return found
 
 

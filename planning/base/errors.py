@@ -141,7 +141,7 @@ MUST_BE = MappingProxyType(
         "string_pattern_mismatch": "a text of the pattern {pattern}",
     }
 )
-"""What a value must be, by Pydantic's name of what is wrong with it."""
+"""Text of what a value must be, by Pydantic's name of its fault."""
 
 
 def schema_words(error: Mapping[str, Any]) -> str:
@@ -209,7 +209,7 @@ MODULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 NO_WHEEL_FROM: Mapping[str, tuple[str, tuple[int, int]]] = MappingProxyType(
     {"pybullet": ("pybullet", (3, 12)), "rtde_receive": ("ur-rtde", (3, 13))}
 )
-"""What an extra leaves out of later Pythons, which have to build it: its name, and the first of them."""
+"""Parts that an extra leaves out of later Pythons, which have to build it: its name, and the first of them."""
 
 
 def require_extra(extra: str, where: str, *, else_allowed: str = "") -> None:

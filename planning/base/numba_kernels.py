@@ -38,7 +38,7 @@ from puncture_twin.planning.base.files import atomic
 
 __all__ = ["allocation_free", "nb"]
 config: Any = nb.config
-"""It makes its attributes when it is loaded."""
+"""Numba's settings, which make their attributes when they are loaded."""
 FOLDER_VARIABLE = "NUMBA_CACHE_DIR"
 """Numba's own: what the user says with it is the place of all folders. Processes that this one begins learn it so."""
 LOCATORS = "UserProvidedCacheLocator,IPythonCacheLocator"
@@ -76,7 +76,7 @@ def _use_folder() -> None:
 
 
 def _place() -> Path:
-    """Where the folders are: as the user tells numba, else in their folder for caches."""
+    """Place of the folders: as the user tells numba, else in their folder for caches."""
     stated = os.environ.get(FOLDER_VARIABLE)
     if stated:
         place = Path(stated).absolute()

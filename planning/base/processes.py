@@ -56,7 +56,7 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
 
 @contextmanager
 def working(jobs: int, pieces: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """What works as ``map`` does, in this process or in several; a function and its results must then be pickled.
+    """A function like ``map``, in this process or in several; a function and its results must then be pickled.
 
     ``jobs``: processes, at most one a core; 1 computes in this one, each piece when its result is taken.
     """

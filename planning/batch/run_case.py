@@ -53,7 +53,7 @@ class CaseTask:
 
 
 class CaseEnd(NamedTuple):
-    """How a case ended."""
+    """Result of running a case."""
 
     id: str
     exit_code: int | None  # of the case's row; None where there is no row, and ``reason`` says why
@@ -196,7 +196,7 @@ class _Worker:
     ready: bool = False
     since: float = field(default_factory=time.monotonic)
 
-    def give(self, task: CaseTask) -> None:
+    def assign(self, task: CaseTask) -> None:
         """Hand a case to the worker; one that has just died is noticed by its sentinel."""
         self.task, self.since = task, time.monotonic()
         with suppress(OSError):
@@ -288,11 +288,11 @@ def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterato
         message = None
     if message == READY:
         worker.ready = True
-        worker.give(worker.task)
+        worker.assign(worker.task)
     elif isinstance(message, CaseEnd):
         yield message
         if queue:
-            worker.give(queue.next(worker.task))
+            worker.assign(queue.next(worker.task))
         else:
             workers.remove(worker)
             worker.end()

@@ -192,7 +192,7 @@ def _ros2(plan: Plan, source: Path, checker: CellChecker | None) -> _Draft:
 
 
 class Exporter(NamedTuple):
-    """How a plan is written in a format, and read back, to be held against the plan before it is published."""
+    """A format of plans: written, read back, and compared with the plan before it is published."""
 
     ending: str
     """Ending of the file's name, such as ``.csv``."""

@@ -42,7 +42,7 @@ PROBABILITIES, VOLUMES = (".npz", ".pkl"), (".nii.gz", ".nii", ".nrrd")
 THUMBNAILS = "@eaDir"
 """The folder in which a file server keeps previews, each named like the file that it shows."""
 APPLE_DOUBLE = "._"
-"""How the name of a file begins in which macOS keeps what another file system cannot, next to the file itself."""
+"""Beginning of the name of a file in which macOS keeps what another file system cannot, next to the file itself."""
 MOST_DEPTH, MOST_INSIDE = 6, 100_000
 """Folders in folders, and entries of each, that are looked through for something that is not accounted for."""
 

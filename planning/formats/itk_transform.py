@@ -187,7 +187,7 @@ _GROUP, _TYPE = "TransformGroup", "TransformType"
 _PARAMETERS = ("TransformParameters", "TranformParameters")
 _FIXED = ("TransformFixedParameters", "TranformFixedParameters")
 _DAMAGED = (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, MemoryError, OverflowError)
-"""What h5py raises for bytes that are no whole HDF5."""
+"""Exceptions of h5py for bytes that are no whole HDF5."""
 _AS_TEXT = (
     ", or the same transform as text: in Slicer, Save with the file format .tfm; "
     "in SimpleITK, WriteTransform(T, 'x.tfm')"

@@ -76,7 +76,7 @@ structures = {count}  # the last line: a truncated file lacks it
 
 @dataclass(frozen=True, eq=False)
 class CaseParts:
-    """What a new case is made of."""
+    """Parts of a new case."""
 
     name: str
     space: Space

@@ -20,7 +20,7 @@ from puncture_twin.planning.formats.labels.label_sources import (
     MASK_ENDINGS,
     SEGMENT_ENDING,
     not_read,
-    refuse_one_name,
+    refuse_same_name,
     structure_name,
 )
 from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, labelmap_of, whole_labels
@@ -56,7 +56,7 @@ LEAST_MARKERS = 3
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user states of the files."""
+    """Statements of the user about the files."""
 
     space: Space  # of meshes, and of lists that do not say theirs
     naming: str | None = None  # of label maps without names
@@ -250,7 +250,7 @@ class _Looker:
         if not masks:
             return
         with self._noting("FILE"):
-            refuse_one_name([one.file for one in masks], where=self._folder)
+            refuse_same_name([one.file for one in masks], where=self._folder)
         alone = len(masks) + len(empty) == len(names) and all(one.lower().endswith(MASK_ENDINGS) for one in names)
         alone = alone and not self._left_out
         self._only = "masks" if alone else ""

@@ -15,7 +15,7 @@ WAYS = (
     "or with `init`: --set KEY=VALUE for a key of the case, --ignore NAME to leave a structure out, --unknown NAME "
     "for one that no path may cross, --skin NAME for another skin"
 )
-"""What `init` can write for what a case would state; the refusals of a case name its keys and roles."""
+"""Options of `init` for what a case would state; the refusals of a case name its keys and roles."""
 OWN_OPTION: Mapping[str, str] = MappingProxyType({
     "region": "--region", "space": "--space", "target.position_mm": "--target",
     "target.structure": "--target-label", "target.hit_radius_mm": "--hit-radius",
@@ -24,7 +24,7 @@ OWN_OPTION: Mapping[str, str] = MappingProxyType({
 SKIN, SKIN_ROLE = "skin", 'role = "skin"'
 """The structure whose ``cut`` is a key too, and the line after which that stands."""
 LISTS = frozenset(("structure", "structures", "obstacle", "end", "schema"))
-"""What `--set` cannot write: tables that stand several times, and what belongs to the file."""
+"""Keys that `--set` cannot write: tables that stand several times, and what belongs to the file."""
 REASONS: Mapping[str, str] = MappingProxyType({"search.trust_labels": "a person checked the structures on the CT"})
 STATED = "stated to init"
 

@@ -147,7 +147,7 @@ def label_text(row: Assigned, file: str, label: int) -> str:
 
 
 LEAST_EXTENT = ((Unit.MM, 130.0), (Unit.CM, 5.0), (Unit.M, 0.0))
-"""From which diagonal of all meshes together on a unit is guessed. A body in mm, with its skin, is seldom smaller than
+"""Least diagonal of all meshes together, by unit that is guessed. A body in mm, with its skin, is seldom smaller than
 130 mm, and in cm (13 to 130) seldom larger; in metres it is smaller than 5."""
 BOTH_MM_AND_CM = (130.0, 250.0)
 """A diagonal between these is a child's or a limb's in mm, or an adult's in cm, ten times as wide."""
@@ -314,7 +314,7 @@ def named_like_body(name: str) -> bool:
 
 
 def agreement(mesh: TriangleMesh, skin: Skin) -> Agreement:
-    """How far a surface and the skin are near to each other, by points of both."""
+    """Agreement of a surface with the skin, by points of both."""
     within_mm = min(NEAR_MM, NEAR * float(np.linalg.norm(np.ptp(skin.mesh.bounds, axis=0))))
     open_skin = ~skin.cut_faces if not skin.cut_faces.all() else skin.cut_faces
     seen = TriangleMesh(skin.mesh.vertices, skin.mesh.faces[open_skin])

@@ -425,12 +425,12 @@ def test_questions_take_turns_and_a_target_comes_before_a_needle():
     for client in (1, 2):
         exchange.open(client)
         for subject in ("needle", "target", "needle"):
-            exchange.ask(Question(client, None, subject, stamp))
-    exchange.ask(Question(3, None, "needle", stamp))  # a client that is gone
+            exchange.put_question(Question(client, None, subject, stamp))
+    exchange.put_question(Question(3, None, "needle", stamp))  # a client that is gone
     taken = [exchange.take() for _ in range(4)]
     assert [(one.client, one.subject) for one in taken] == [(1, "target"), (2, "target"), (1, "needle"), (2, "needle")]
     assert taken[3].stamp == stamp
-    exchange.ask(Question(2, None, "needle", stamp))
+    exchange.put_question(Question(2, None, "needle", stamp))
     exchange.drop(2)
     exchange.close()
     assert exchange.take() is None

@@ -159,7 +159,7 @@ def _first(outside: int, _: int, frame: FrameType | None) -> None:
 
 
 def _unbreakable(frame: FrameType | None) -> int:
-    """How many of a frame, and of those that led to it, are of `UNBREAKABLE`."""
+    """Count of a frame, and of those that led to it, that are of `UNBREAKABLE`."""
     count = 0
     while frame is not None:
         count += str(frame.f_globals.get("__name__")).partition(".")[0] in UNBREAKABLE

@@ -74,7 +74,7 @@ def map_view(case: Any, candidates: Candidates) -> MapView:
         if name in vectors and np.hypot(*vectors[name][:2]) > IN_PLANE:
             rotation = np.pi / 2 - float(np.arctan2(vectors[name][1], vectors[name][0]))
             break
-    theta_max = float(candidates.theta.max(initial=0.0)) + 0.5 * step_of(candidates)
+    theta_max = float(candidates.theta.max(initial=0.0)) + 0.5 * grid_step(candidates)
     centre = max(vectors, key=lambda name: vectors[name][2])
     exact = vectors[centre][2] > np.cos(np.radians(1.0))
     rim: list[RimLabel] = []
@@ -92,7 +92,7 @@ def map_view(case: Any, candidates: Candidates) -> MapView:
     return MapView(rotation, theta_max, tuple(rim), centre if exact else "")
 
 
-def step_of(candidates: Candidates) -> float:
+def grid_step(candidates: Candidates) -> float:
     """The grid's step in θ (else in β), rad; one degree where there is one direction only."""
     for values in (candidates.theta, candidates.beta):
         gaps = np.diff(np.unique(values))
@@ -116,7 +116,7 @@ class MapCells:
     @classmethod
     def of(cls, candidates: Candidates) -> MapCells:
         """The cells of a search's grid."""
-        step, wrapped = step_of(candidates), np.mod(candidates.beta, 2 * np.pi)
+        step, wrapped = grid_step(candidates), np.mod(candidates.beta, 2 * np.pi)
         by_theta = np.argsort(candidates.theta, kind="stable")
         fresh = np.diff(candidates.theta[by_theta]) > RING_SLACK
         ring = np.empty(len(by_theta), dtype=np.int64)

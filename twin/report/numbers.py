@@ -10,7 +10,7 @@ from puncture_twin.planning.base import reasons
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.place.mounts import Region, ring_weights
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.twin.report.map_view import body_directions, step_of
+from puncture_twin.twin.report.map_view import body_directions, grid_step
 from puncture_twin.twin.report.present import number
 
 TRUTH_IS_BELIEF = (
@@ -33,7 +33,7 @@ class ReasonCount:
 
 def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     """Counts of the verdicts: safe first, then the reasons that occur, most frequent first."""
-    weights = ring_weights(candidates.theta, step_of(candidates))
+    weights = ring_weights(candidates.theta, grid_step(candidates))
     lines: list[tuple[str, str, reasons.Rgb, Bools]] = []
     air = candidates.unseen_air
     for value in np.unique(candidates.verdict.reason):
@@ -61,7 +61,7 @@ def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
     return candidates.clearance.structures[best], float(candidates.clearance.by_structure[row, best])
 
 
-def carried_mm(scan: Any | None) -> tuple[int, str]:
+def carried_digits(scan: Any | None) -> tuple[int, str]:
     """Digits of a mm that a CT's voxels carry, and half the longest side of one as " ± 0.4"; 1 and "" without."""
     if scan is None:
         return 1, ""
@@ -71,7 +71,7 @@ def carried_mm(scan: Any | None) -> tuple[int, str]:
 
 def length_text(mm: float, scan: Any | None) -> str:
     """A length in the digits that the CT carries, as "93 ± 3 mm"."""
-    digits, tolerance = carried_mm(scan)
+    digits, tolerance = carried_digits(scan)
     return number(mm, digits, f"{tolerance} mm".strip())
 
 

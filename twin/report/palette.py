@@ -27,7 +27,7 @@ ORGAN_COLOURS: tuple[Rgb, ...] = (  # for structures without a colour of custom,
 )  # fmt: skip
 
 LESION, ARTERY, VEIN, PORTAL = (255, 215, 6), (178, 54, 10), (0, 140, 226), (125, 60, 190)
-"""What a needle is aimed at, and what bleeds: these are told from everything at a glance, by every reader."""
+"""Colours of a needle's aim and what bleeds: these are told from everything at a glance, by every reader."""
 
 NERVE, BILE, URINE, BONE, MUSCLE = (255, 255, 160), (157, 154, 103), (230, 190, 230), (244, 229, 192), (131, 105, 100)
 CARTILAGE, HEART = (188, 206, 186), (185, 39, 82)

@@ -63,7 +63,7 @@ def windows(candidates: Candidates, scan: Any | None) -> list[Block]:
     if candidates.cone_source:
         source = CONE_TEXT[candidates.cone_source]
         text += f" Safe cone: angle by which the needle may be off and stay safe for the organs, {source}."
-    return [grid(_window_fields(candidates, *numbers.carried_mm(scan)), ranked[:MOST_WINDOWS]), text]
+    return [grid(_window_fields(candidates, *numbers.carried_digits(scan)), ranked[:MOST_WINDOWS]), text]
 
 
 def _window_fields(candidates: Candidates, digits: int, tolerance: str) -> list[Field]:

@@ -29,7 +29,7 @@ NOTHING = "–"  # where there is no number
 
 PLAIN = str.maketrans({"−": "-", "–": "-", "θ": "theta", "β": "beta", "°": " deg", "²": "2", "₂": "2", "₁": "1",
                        "χ": "chi", "σ": "sigma", "’": "'", "≥": ">=", "“": "'", "”": "'", "×": "x"})  # fmt: skip
-"""What a terminal shows in place of a page's letters, in tables and sentences; titles and paths stay as they are."""
+"""Text of a terminal in place of a page's letters, in tables and sentences; titles and paths stay as they are."""
 FOLDED = 10  # letters: a shorter head is not folded
 TIMES = Markup('<p class="faint">Date and duration of each stage: <a href="timings.json">timings.json</a>.</p>')
 

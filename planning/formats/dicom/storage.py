@@ -14,7 +14,7 @@ META_START = PREAMBLE_BYTES + len(MAGIC)
 
 
 class Kind(StrEnum):
-    """How this project treats a DICOM file."""
+    """Kind of a DICOM file, by how this project treats it."""
 
     CT = "CT"
     SEGMENTATION = "SEG"
@@ -44,7 +44,7 @@ NOT_READ = (BIG_ENDIAN, DEFLATED)
 
 
 def kind_of(sop_class: str) -> Kind:
-    """How a file of this SOP class is treated."""
+    """Kind of a file of this SOP class."""
     return _KINDS.get(sop_class, Kind.OTHER)
 
 

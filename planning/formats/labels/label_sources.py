@@ -59,11 +59,11 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
         raise not_read(left, "masks", where)
     if not 1 <= len(files) <= MAX_MASKS:
         refuse(f"'{folder.name}' has {len(files)} masks", where, allowed, "wrong_count")
-    refuse_one_name(files, where)
+    refuse_same_name(files, where)
     return tuple(files)
 
 
-def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
+def refuse_same_name(files: Sequence[str], where: str | Path) -> None:
     """Refuse two masks of a folder that are of one structure, such as ``liver.nii`` next to ``liver.nii.gz``."""
     names: dict[str, str] = {}
     for file in files:

@@ -43,7 +43,7 @@ MAX_LABEL = 65_535
 """Label maps are 8 or 16 bit; a larger value means that an image was given instead."""
 ALLOWED = f"whole numbers from 0 (background) to {MAX_LABEL}"
 ROUNDED_BY = 0.02
-"""So far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
+"""How far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
 LEAST_WHOLE = 0.15
 """Fraction of voxels besides the background: a blended map is whole inside its labels, an image in 4 % by chance."""
 FLAT, NEAR_MM, SPECK_MM2 = 0.5, 6.0, 100.0

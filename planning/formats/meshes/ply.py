@@ -149,7 +149,7 @@ class _Cursor:
         return (self._take_even(element) or self._take_row_by_row(element)) if element.rows else {}
 
     def _length(self, prop: _Property, position: int) -> tuple[int, int]:
-        """How many numbers a property has at a position, and where they start."""
+        """Count of a property's numbers at a position, and where they start."""
         start, length = position, 1
         if prop.count_dtype is not None:
             start += prop.count_dtype.itemsize

@@ -29,7 +29,7 @@ _NOTES = ("METADATA", "INFORMATION")
 _OFFSETS_SINCE = 5
 """The major version from which on cells are offsets and connectivity."""
 _DATA = ("POINT_DATA", "CELL_DATA")
-"""What follows the surface: numbers about it, which are not read."""
+"""Keywords that end the surface: numbers about it follow, which are not read."""
 
 
 class _Polygons(NamedTuple):

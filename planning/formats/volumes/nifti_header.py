@@ -54,7 +54,7 @@ class _Fields(NamedTuple):
 
 
 def parse_nifti_header(content: bytes, path: Path) -> volume_header.VolumeHeader:
-    """What the header of a file says; of a .nii.gz no more is inflated. Raises InputError: whatever is wrong with it.
+    """The header of a NIfTI file; of a .nii.gz no more is inflated. Raises InputError: whatever is wrong with it.
 
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
     (SimpleITK takes the sform if its code is 1, else the qform).

@@ -114,10 +114,10 @@ SKIPS = {"byteskip": ("0", "-1"), "lineskip": ("0",)}
 """-1: the data are the file's last bytes, which here all of them must be: after a cut others would be the last."""
 GZIP = frozenset(("gzip", "gz"))
 AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
-"""What an axis may be that runs through space; others (vector, list, color) hold several values per voxel."""
+"""Kinds of an axis that runs through space; others (vector, list, color) hold several values per voxel."""
 VECTOR = re.compile(r"\(([^()]*)\)")
 LAYER_KINDS = frozenset(("list", "vector"))
-"""What Slicer calls the axis of its layers: "list"; older versions "vector"."""
+"""Kinds that Slicer gives the axis of its layers: "list"; older versions "vector"."""
 MAX_LAYERS = 1000
 """A layer more is needed only where another segment overlaps all the layers before."""
 UNNAMED_SPACE = "its header states no patient space; read as LPS, as in ITK and Slicer"
@@ -129,7 +129,7 @@ def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
 
 
 def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
-    """What the header of a segmentation says whose segments may overlap: one volume, or several as layers.
+    """The header of a segmentation whose segments may overlap: one volume, or several as layers.
 
     Layers are the first axis, which runs fastest in the file (Slicer, "Segmentations", file format).
     """

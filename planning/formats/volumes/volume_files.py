@@ -25,7 +25,7 @@ from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 NRRD_ENDINGS = (".nrrd", ".nhdr")
 MAX_FILE_BYTES = 8 * volume_header.MAX_VOXELS + 10_000_000
-"""As many voxels as are taken, of the widest type, behind the longest header."""
+"""Most bytes of a file: the most voxels, of the widest type, behind the longest header."""
 SCALING_ROUNDING = float(np.finfo(np.float64).eps)
 """A slope this near to 1, and an intercept this near to 0, leave the stored values and their type as they are."""
 
@@ -152,12 +152,12 @@ class VolumeFile:
 
     @cached_property
     def grid(self) -> volume_header.VolumeHeader:
-        """Where the voxels lie, LPS mm, as the checked header states it."""
+        """Grid of the voxels, LPS mm, as the checked header states it."""
         return parse_header(self.content(self.files[0]), self.path)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a person should be told of how the header was read."""
+        """Notes for a person on how the header was read."""
         return self.grid.notes
 
     def volume(self) -> Volume:

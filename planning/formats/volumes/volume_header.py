@@ -27,7 +27,7 @@ MAX_ORIGIN_MM = 100_000.0
 
 @dataclass(frozen=True)
 class VoxelLayout:
-    """How a file stores its voxels, axis i first."""
+    """Storage of a file's voxels, axis i first."""
 
     dtype: np.dtype[Any]  # of one voxel, with the file's byte order
     encoding: str  # ``raw`` or ``gzip``: of all that the file holds from byte ``start`` on
@@ -177,7 +177,7 @@ def first_bytes(content: memoryview, count: int, *, where: Path, allowed: str) -
 
 
 def _parts(content: memoryview, most: int) -> Iterator[bytes]:
-    """What gzip data inflate to, in parts: at most so many bytes, and the check sums of all members that end there."""
+    """Parts of what gzip data inflate to: at most so many bytes, and the check sums of all members that end there."""
     at, member = 0, zlib.decompressobj(GZIP_WINDOW)
     while most > 0:
         waiting: bytes | memoryview = member.unconsumed_tail

@@ -26,7 +26,7 @@ def test_the_rms_is_over_the_runs_that_ended_and_refusals_are_named(monkeypatch)
     monkeypatch.setattr(module, "plan_tour", lambda *_, **__: TOUR)
     monkeypatch.setattr(module, "physical_run", one_run)
     drawn = lambda context, tour, seed: "no" if seed % 4 == 1 else SimpleNamespace(tip_error_mm=2.0)  # noqa: E731
-    monkeypatch.setattr(module, "drawn_once", drawn)
+    monkeypatch.setattr(module, "use_without_physics", drawn)
     facts = module.physical_runs(CONTEXT, 3)
     assert facts["realised_mm"] == pytest.approx(12.5**0.5)
     assert facts["refused"] == {2: "marker A was not felt"}
@@ -42,7 +42,7 @@ def test_runs_none_of_which_ended_give_no_figure(monkeypatch):
     """No mean of nothing, and the reason."""
     monkeypatch.setattr(module, "plan_tour", lambda *_, **__: TOUR)
     monkeypatch.setattr(module, "physical_run", lambda *_: one_run(None, None, 2))
-    monkeypatch.setattr(module, "drawn_once", lambda *_: SimpleNamespace(tip_error_mm=2.0))
+    monkeypatch.setattr(module, "use_without_physics", lambda *_: SimpleNamespace(tip_error_mm=2.0))
     facts = module.physical_runs(CONTEXT, 1)
     assert facts["realised_mm"] is None and facts["seconds_per_touch"] is None
     assert "none of 1 physical run ended" in module.physical_text(facts)

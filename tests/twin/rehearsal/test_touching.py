@@ -205,7 +205,7 @@ def test_a_run_errs_as_its_drawn_twin(context, done):
     """The same truth without physics: what contact costs, some hundredths of a millimetre, is all between them."""
     run = done[0]
     q, outward = touch_job._puncture(context, CHOICE)
-    drawn = touch_job.drawn_once(context, touch_job.Tour(run.plan, q, outward), run.seed)
+    drawn = touch_job.use_without_physics(context, touch_job.Tour(run.plan, q, outward), run.seed)
     assert drawn.tip_error_mm == pytest.approx(run.use.tip_error_mm, abs=0.05)
     assert drawn.expected_mm == pytest.approx(run.use.expected_mm, rel=0.01)
 
@@ -215,7 +215,7 @@ def test_drawn_truths_err_as_the_plan_predicts(context, done):
     run = done[0]
     q, outward = touch_job._puncture(context, CHOICE)
     tour = touch_job.Tour(run.plan, q, outward)
-    errors = [touch_job.drawn_once(context, tour, seed).tip_error_mm for seed in range(60)]
+    errors = [touch_job.use_without_physics(context, tour, seed).tip_error_mm for seed in range(60)]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(run.plan.expected_mm, rel=0.17)
 
 

@@ -24,7 +24,7 @@ from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report import annotate, patient as patient_blocks
 from puncture_twin.twin.report.map.map_picture import DISC, map_figure
 from puncture_twin.twin.report.map.map_raster import map_raster
-from puncture_twin.twin.report.map_view import map_view, step_of
+from puncture_twin.twin.report.map_view import grid_step, map_view
 from puncture_twin.twin.report.numbers import length_text, nearest_text, reason_counts
 from puncture_twin.twin.report.page import page_data
 from puncture_twin.twin.report.page.page import Shown, write_page
@@ -146,7 +146,7 @@ def test_counts_and_solid_angles(case, candidates):
     assert lines[0].code == "safe"
     assert sum(line.count for line in lines) == len(candidates)
     assert sum(line.solid_angle for line in lines) == pytest.approx(1)
-    weights = ring_weights(candidates.theta, step_of(candidates))
+    weights = ring_weights(candidates.theta, grid_step(candidates))
     cap = weights[candidates.theta < np.radians(31)].sum() / weights.sum()
     assert cap == pytest.approx((1 - np.cos(np.radians(32.5))) / (1 - np.cos(np.radians(92.5))))
 

@@ -23,7 +23,7 @@ from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 
-def lists_of(
+def checks_list(
     entries: Path | None, targets: Path | None, choice: Choice, *, picture: Path | None, out_dir: Path | None
 ) -> bool:
     """Whether a list is to be checked; options that do not go together are refused."""

@@ -69,7 +69,7 @@ class PivotRun:
         }
 
 
-def refuse_of_twin(*options: object) -> None:
+def refuse_twin_options(*options: object) -> None:
     """Refuse options of the twin beside touches that were read."""
     if any(option is not None for option in options):
         allowed = "JOINTS.csv, or the options of the twin"
@@ -101,7 +101,7 @@ def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> 
 
 
 def pivot_text(run: PivotRun) -> str:
-    """For the terminal."""
+    """Text of a calibrated tip, for the terminal."""
     return text(_pivot_said(run))
 
 
@@ -210,7 +210,7 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
 
 
 def pivot_tour_text(run: PivotTourRun) -> str:
-    """For the terminal."""
+    """Text of an executed pivot calibration, for the terminal."""
     expected = float(np.sqrt(np.trace(run.calibration.pivot.cov_tip)))
     at, count, seconds = vector(run.place_base, 0, "mm"), len(run.touched.readings), run.touched.seconds
     failed = [f"{name} not touched: {why}" for name, why in run.touched.failed.items()]

@@ -117,7 +117,7 @@ def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angl
 
 
 def sweep_text(run: SweepRun) -> str:
-    """For the terminal."""
+    """Text of a sweep, for the terminal."""
     plan, off = run.plan, run.swept.off_mm
     start, end, wanted = (
         "theta {:.1f}, beta {:.1f}".format(*np.degrees(one)) for one in (plan.angles[0], plan.angles[-1], plan.wanted)

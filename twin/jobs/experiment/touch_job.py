@@ -158,7 +158,7 @@ def touch_once(context: CaseContext, tour: Tour, seed: int) -> tuple[ExecutedTou
     return touched, _use(context, tour, truth, _points(touched))
 
 
-def drawn_once(context: CaseContext, tour: Tour, seed: int) -> Use | str:
+def use_without_physics(context: CaseContext, tour: Tour, seed: int) -> Use | str:
     """Quality of a tour in the same truth without physics, where every touch reads its joints exactly."""
     plan, truth = tour.plan, true_touches(context, tour, seed)
     joints = np.array([truth.q_contact(plan.model, plan.tip_mm, touch) for touch in plan.touches])
@@ -237,7 +237,7 @@ TOUCHED = (
 
 
 def touch_text(run: TouchRun) -> str:
-    """For the terminal."""
+    """Text of the touches, for the terminal."""
     plan, touched, use = run.plan, run.touched, run.use
     each = f", {_per_touch(touched):.1f} s each" if touched.readings else ""
     of = f" of {len(touched.readings) + len(touched.failed)}" if touched.failed else ""
@@ -276,7 +276,7 @@ def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
         except NoAnswerError as error:
             refused[seed] = str(error)
         context.watcher.count("runs", seed + 1, runs)
-    uses = {seed: drawn_once(context, tour, seed) for seed in range(max(DRAWS, runs))}
+    uses = {seed: use_without_physics(context, tour, seed) for seed in range(max(DRAWS, runs))}
     errors_mm = {seed: float("nan") if isinstance(use, str) else use.tip_error_mm for seed, use in uses.items()}
     alike = [errors_mm[one["seed"]] for one in ended if np.isfinite(errors_mm[one["seed"]])]
     return {
@@ -317,7 +317,7 @@ def physical_run(context: CaseContext, tour: Tour, seed: int) -> dict[str, Any]:
 
 
 def physical_text(facts: Mapping[str, Any]) -> str:
-    """For a person; where one axis errs most, an rms is known to one over the root of twice their number."""
+    """Text of physical runs; where one axis errs most, an rms is known to one over the root of twice their number."""
     ended, drawn = facts["runs"], facts["drawn"]
     refused = [f"seed {seed}: {why}" for seed, why in facts["refused"].items()]
     if not ended:

@@ -275,7 +275,7 @@ class LedTouches:
         }  # fmt: skip
 
 
-def refuse_of_twin(choice: Choice, seed: int) -> None:
+def refuse_twin_options(choice: Choice, seed: int) -> None:
     """Refuse options of the twin alone beside ``--host``."""
     if choice != Choice() or seed:
         refuse("a direction, or a seed, beside --host", "touch", "--host HOST alone: no tour is planned",
@@ -313,7 +313,7 @@ ROWS = (
 
 
 def led_text(read: LedTouches) -> str:
-    """For the terminal."""
+    """Text of touches that were led by hand, for the terminal."""
     said = read.summary()
     left = [f"not touched: {', '.join(said['left_out'])}"] if said["left_out"] else []
     few = [] if read.suffices else [f"no registration: {MIN_MARKERS} markers are needed"]

@@ -72,7 +72,7 @@ class Exchange:
             self._asked.notify()
             self._given.notify_all()
 
-    def ask(self, question: Question) -> None:
+    def put_question(self, question: Question) -> None:
         """Put a question in place of an older one."""
         with self._lock:
             if question.client in self._answers:
@@ -105,7 +105,7 @@ class Exchange:
         silent = InputError(what, where="OpenIGTLink Needle", allowed=allowed, code="needle_silent")
         return posed._replace(message=None, fault=silent)
 
-    def take_of(self, client: int, subject: str) -> Question | None:
+    def take_from(self, client: int, subject: str) -> Question | None:
         """Question of a client about a subject, out of turn; None without one."""
         with self._lock:
             return self._taken(client, subject) if subject in self._questions.get(client, {}) else None
@@ -117,7 +117,7 @@ class Exchange:
             self._questions[client] = waiting
         return question
 
-    def give(self, client: int, answer: Answer) -> None:
+    def put_answer(self, client: int, answer: Answer) -> None:
         """Put an answer in place of an older one of its name."""
         with self._lock:
             if client in self._answers:
@@ -204,7 +204,7 @@ def _compute(exchange: Exchange, planner: Planner) -> None:
     while (question := exchange.take()) is not None:
         _answer(exchange, planner, question)
         if question.subject == "target":
-            needle = exchange.take_of(question.client, "needle") or planner.needle(question.session)
+            needle = exchange.take_from(question.client, "needle") or planner.needle(question.session)
             if needle is not None:
                 _answer(exchange, planner, needle)
 
@@ -213,14 +213,14 @@ def _answer(exchange: Exchange, planner: Planner, question: Question) -> None:
     fault = None
     try:
         for answer in planner.answers(question):
-            exchange.give(question.client, answer)
+            exchange.put_answer(question.client, answer)
     except PlanningError as error:
         fault = error
     except Exception as error:  # the last line of defence: the others are answered on
         LOG.exception("live: the program failed")
         fault = PlanningError(f"the program failed: {error!r}")
     for answer in () if fault is None else planner.refused(question.subject, question.stamp, fault):
-        exchange.give(question.client, answer)
+        exchange.put_answer(question.client, answer)
 
 
 def _notice_the_vanished(connection: socket.socket) -> None:
@@ -319,7 +319,7 @@ class Client:
                 what = f"{header.kind} '{header.name}' of {header.size} bytes is not used"
                 refuse(what, "OpenIGTLink", USED, "unknown_message")
             message = read_message(header, self._exactly(header.size, until))
-            self._exchange.ask(Question(self._number, self._session, subject, message.stamp, message))
+            self._exchange.put_question(Question(self._number, self._session, subject, message.stamp, message))
         except InputError as error:
             self._wrong(subject, header, error)
 
@@ -328,10 +328,10 @@ class Client:
         first = error.code not in self._logged
         self._line(error.code, str(error))
         if subject is not None:
-            self._exchange.ask(Question(self._number, self._session, subject, header.stamp, fault=error))
+            self._exchange.put_question(Question(self._number, self._session, subject, header.stamp, fault=error))
         elif first:
             for answer in self._planner.refused(None, header.stamp, error):
-                self._exchange.give(self._number, answer)
+                self._exchange.put_answer(self._number, answer)
 
     def _exactly(self, size: int, until: float) -> bytes:
         data = bytearray()

@@ -46,7 +46,7 @@ LIMITS: Mapping[tuple[int, str], float] = {  # what must be reached, mm
 }
 
 OVER_BOUND: Mapping[str, float] = {"Gauss-Newton": 1.2, "weighted": 1.05}
-"""How far above the Cramer-Rao bound of the same recordings a method may be."""
+"""Most error of a method in terms of the Cramer-Rao bound of the same recordings."""
 
 MOST_STEPS = 10  # steps of the refinement from 20 poses on
 OUTLIER_FRACTION, OUTLIER_MM = 0.1, 5.0
@@ -208,7 +208,7 @@ FIELDS = (
 
 
 def reproduction_text(facts: Mapping[str, Any]) -> str:
-    """For a person: the specified numbers beside ours."""
+    """Text of the specified numbers and ours."""
     verdict = "all within their limits" if facts["holds"] else "NOT all within their limits"
     wider = f"; the limits are those of {RUNS} runs, widened for the chance of fewer runs"
     ending = f"{facts['runs']} runs per row, seed {facts['seed']}: {verdict}{'' if facts['runs'] >= RUNS else wider}"

@@ -117,7 +117,7 @@ def _error(T: Floats, name: str, touched: Mapping[str, chen.Point]) -> float:
 
 
 def worked_reach(T_base_ct: Floats) -> tuple[float, float]:
-    """How far the worked pose's flange is from a UR3's shoulder, and how far the arm can span in any orientation; mm.
+    """Distance of the worked pose's flange from a UR3's shoulder, and the most that the arm can span; mm.
 
     The span is an upper bound: all links and wrist offsets stretched in one plane, d4 at a right angle to it.
     """

@@ -246,7 +246,7 @@ def hand_eye_summary(fit: HandEye) -> dict[str, Any]:
 
 
 def hand_eye_text(summary: dict[str, Any]) -> str:
-    """For a person."""
+    """Text of a hand-eye calibration."""
     rows = [
         (name, " x ".join(f"{one:.3f}" for one in half["rotation_deg"]), " x ".join(
             f"{one:.3f}" for one in half["translation_mm"]))

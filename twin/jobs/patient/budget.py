@@ -92,7 +92,7 @@ def _change(case: Case, one: Change) -> dict[str, Any]:
 
 
 def correction_facts(case: Case, registration: Registration) -> dict[str, Any] | None:
-    """What a corrected aim wins at its own insertion, mm; None where the case corrects none."""
+    """Gain by a corrected aim at its own insertion, mm; None where the case corrects none."""
     aim, plain = registration.aim, registration.uncertainty
     if aim is None or plain is None or case.errors is None:
         return None

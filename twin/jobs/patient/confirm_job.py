@@ -138,7 +138,7 @@ class Confirmed(Shown):
         return present.text([*self.sections(SHOWN), *present.footer(self.files, [o.sentence for o in self.findings])])
 
     def sections(self, most: int | None = None) -> list[Section]:
-        """What terminal and page show; of structures so many, or all."""
+        """Sections for terminal and page; of structures so many, or all."""
         needle, tie, line, said = self.needle, self.tie, self.line, self.predicted()
         at_target, off = self.against(self.context.case.target_ct, needle.forward_ct), f"± {tie.sd_mm:.2f} mm"
         rows = [

@@ -94,7 +94,7 @@ class Written(Shown):
         return text(self.said)
 
 
-def _of_path(name: str, files: tuple[Path, ...], path: str, notes: Sequence[str], warnings: Sequence[str],
+def _written_path(name: str, files: tuple[Path, ...], path: str, notes: Sequence[str], warnings: Sequence[str],
              inputs: tuple[Input, ...]) -> Written:  # fmt: skip
     facts = {"path": path, "notes": list(notes), "warnings": list(warnings)}
     lines: list[Block] = [Warn(tuple(map(str, files))), *notes, *(f"warning: {one}" for one in warnings)]
@@ -143,7 +143,7 @@ def export_path(
             contents, notes = archive.archive_files(scan, _archived(context, scan, candidates, pick)), (NO_DEVICE,)
         written = _put(draft, contents)
     said = (NO_APPROACH if plan is None else PLANNED, f"arm: {candidates.arm_note}", *notes)
-    return _of_path(format_name, written, name, said, context.anatomy.warnings, inputs)
+    return _written_path(format_name, written, name, said, context.anatomy.warnings, inputs)
 
 
 def export_confirmation(source: Path, scan: Path, out: Path, note: Note) -> Written:
@@ -177,7 +177,7 @@ def export_confirmation(source: Path, scan: Path, out: Path, note: Note) -> Writ
     inputs = (read.input("confirmation"), *files.inputs)
     with writing(out, f"export {archive.DICOM}", inputs=inputs, names=archive.NAMES, note=note) as draft:
         written = _put(draft, contents)
-    return _of_path(archive.DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
+    return _written_path(archive.DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
 
 
 def _series(case: Case) -> CtSeries:

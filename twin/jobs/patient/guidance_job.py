@@ -79,7 +79,7 @@ class Compared:
     files: tuple[Path, ...] = ()
 
     def failures(self, one: Rated) -> list[str]:
-        """Where more of a guidance's trials missed or touched than the case allows."""
+        """Sentences where more of a guidance's trials missed or touched than the case allows."""
         return list(trial_failures(self.context.case, one.distribution))
 
     @property
@@ -109,7 +109,7 @@ class Compared:
         }
 
     def sections(self) -> list[Section]:
-        """What terminal and page show."""
+        """Sections for terminal and page."""
         rows = self.rows()
         first, patients = rows[0], plural(rows[0]["rooms"], "patient")
         lost = [f"{row['guidance']}: {one}" for row in rows for one in (*row["failures"], *row["lost_sight"])]

@@ -43,7 +43,7 @@ Run = TypeVar("Run", "MarkersRun", "ProposalRun")
 ALLOWED = "a folder with one CT, a CT file (NIfTI, NRRD, a DICOM folder), or a case with one"
 
 
-def stated_of(
+def stated_markers(
     kind: str | None, diameter_mm: float | None, count: int | None, layout: Path | None, propose: int | None
 ) -> Stated:
     """Statements of a person about the markers; none may accompany a proposal."""
@@ -199,7 +199,7 @@ def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, w
 
 
 class _Sheet(NamedTuple):
-    """What is drawn and listed: points in LPS, or the local frame, whose ``space`` is that of the CSV."""
+    """Points that are drawn and listed, in LPS, or the local frame, whose ``space`` is that of the CSV."""
 
     name: str
     points: NamedPoints

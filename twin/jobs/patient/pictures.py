@@ -37,7 +37,7 @@ from puncture_twin.twin.report.slices.planes import Plane, letters, needle_plane
 from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
 
 EDGES = {(0.06, 0.56): (-1, 0), (0.94, 0.56): (1, 0), (0.5, 0.03): (0, -1), (0.5, 0.97): (0, 1)}
-"""Where the patient's directions are written on a panel, as fractions of it, and along which of its axes."""
+"""Places of the patient's directions on a panel, as fractions of it, and along which of its axes."""
 SLICE_PIXELS, INCHES, DPI = 320, 9.0, 100
 WINDOW_HU = (-160.0, 240.0)
 

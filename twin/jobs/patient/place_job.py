@@ -88,11 +88,11 @@ def place_case(
     except NoAnswerError:
         withdraw(out, "place")
         raise
-    refuse_none(run.search)
+    refuse_unreached(run.search)
     return replace(run, files=draft.final(run.files))
 
 
-def refuse_none(search: place.PlaceSearch) -> None:
+def refuse_unreached(search: place.PlaceSearch) -> None:
     """Refuse a search in which no placement reaches a direction: its best is none."""
     if not any(one.verdict.reached for one in search.rated):
         what = f"the arm reaches no organ-safe direction from any placement ({plural(search.checked[0], 'check')})"

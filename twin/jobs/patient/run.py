@@ -182,7 +182,7 @@ class Run:
         return tuple(notes)
 
     def text(self) -> str:
-        """What a person reads: what must be read first, the search, then what was done with it; then the files."""
+        """Text for a person: what must be read first, the search, then what was done with it; then the files."""
         anatomy, belief = self.context.anatomy, self.rehearsal is not None and self.rehearsal.truth_is_belief
         first = [Section(f"NOTE: {TRUTH_IS_BELIEF}", [])] if belief else []
         notes = [Section(f"note: {one.sentence}", []) for one in anatomy.findings if one.severity is Severity.NOTE]

@@ -28,7 +28,7 @@ INSET_SCALE = 6  # the inset shows so many camera pixels to each side of the bal
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def draw_cameras(session: Session, path_of: Path) -> list[Path]:
+def draw_cameras(session: Session, folder: Path) -> list[Path]:
     """Write ``camera_1.png``, ``camera_2.png``: the first target's end, as each camera sees it; returns the paths."""
     reached = next((one for one in session.reached if one.servoed.visits), session.reached[0])
     paths = []
@@ -36,7 +36,7 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
         figure = figure_of(WIDTH_PX, round(WIDTH_PX * camera.height / camera.width))
         axes = picture_axes(figure, _workcell_picture(session, reached, camera))
         _annotate(axes, session, reached, number)
-        paths.append(path_of / f"camera_{number + 1}.png")
+        paths.append(folder / f"camera_{number + 1}.png")
         write_png(figure, paths[-1])
     return paths
 
@@ -88,7 +88,7 @@ def _annotate(axes: Axes, session: Session, reached: Reached, number: int) -> No
 
 
 def _inset(axes: Axes, session: Session, reached: Reached, number: int) -> None:
-    """What the camera measures: the analytic picture of the ball, enlarged, with the outline that was found."""
+    """Draw what the camera measures: the analytic picture of the ball, enlarged, with the outline that was found."""
     workcell, tool = session.workcell, session.workcell.case.file.tool
     camera, believed = workcell.cameras[number], session.calibration.cameras[number]
     seen, plan = reached.servoed.visits[-1].seen.ball_c, workcell.case.file.cameras

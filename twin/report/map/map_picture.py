@@ -22,7 +22,7 @@ from puncture_twin.twin.report import numbers
 from puncture_twin.twin.report.figures import figure_of, write_png
 from puncture_twin.twin.report.map import map_raster
 from puncture_twin.twin.report.map.map_raster import RADIUS, MapRaster
-from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_of
+from puncture_twin.twin.report.map_view import BEYOND, MapView, grid_step, map_view
 from puncture_twin.twin.report.palette import safe_shades
 from puncture_twin.twin.report.present import number, percent
 
@@ -66,7 +66,7 @@ def map_figure(
     _column(figure.add_axes(SIDE), candidates, view, pick, scan)
     title = f"{case.name}: entry directions to {numbers.target_text(case)}"
     figure.text(0.02, 0.955, title, fontsize=19, weight="bold")
-    line = f"{plural(len(candidates), 'direction')}, step {np.degrees(step_of(candidates)):g}°"
+    line = f"{plural(len(candidates), 'direction')}, step {np.degrees(grid_step(candidates)):g}°"
     line += f";  {numbers.needle_text(case)}"
     if not candidates.arm_checked:
         line += ";  ARM NOT CHECKED"
@@ -84,7 +84,7 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
     y = _chance_key(axes, candidates, y)
     y = _mark_key(axes, candidates, view, y)
     _chosen(axes, candidates, pick, y, scan)
-    whole = candidates.grid is None or (candidates.grid.full_circle and candidates.theta.min() < step_of(candidates))
+    whole = candidates.grid is None or (candidates.grid.full_circle and candidates.theta.min() < grid_step(candidates))
     outside = "" if whole else f"White with lines: {NOT_SEARCHED_TEXT}.\n"
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
     if view.theta_max > BEYOND:

@@ -155,7 +155,7 @@ def _apart(places: Floats, spacing: float) -> Ints:
 RADIUS = 412  # of the disc, pixels
 DPI = 130  # dots an inch of the map; letters and lines are in points
 RINGS_AT, RINGS_CLEAR = np.radians((67.5, 52.5, 22.5, 112.5, 127.5)), 0.09
-"""Where the rings' angles may be written, counter-clockwise from the right: the first at which every mark keeps so far
+"""Angles of the rings' labels, counter-clockwise from the right: the first at which every mark keeps so far
 from them, in the disc's radii."""
 
 RIM_LABEL = 0.95  # of the disc's radii: the angle of a ring at the rim stands there, not over the line

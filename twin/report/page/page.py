@@ -23,7 +23,7 @@ from puncture_twin.twin.report import numbers, patient, present
 from puncture_twin.twin.report.error_pictures import budget_figure, rehearsal_png
 from puncture_twin.twin.report.figures import png
 from puncture_twin.twin.report.map.map_raster import MapRaster
-from puncture_twin.twin.report.map_view import step_of
+from puncture_twin.twin.report.map_view import grid_step
 from puncture_twin.twin.report.page.page_data import arm_data, map_data, picked_row, scene_figure
 from puncture_twin.twin.report.page.page_slices import slices_data
 from puncture_twin.twin.report.page.template import base64_text, plotly_script, script_json, write_html
@@ -197,7 +197,7 @@ def _angles(candidates: Candidates, row: int) -> str:
 
 def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
     """Text of the methods: what was checked, by what, and what was not."""
-    theta, step = np.degrees(candidates.theta), np.degrees(step_of(candidates))
+    theta, step = np.degrees(candidates.theta), np.degrees(grid_step(candidates))
     checked = sum(1 for one in anatomy.checked if str(one.role) in {"avoid", "unknown"})
     arm = "The arm was not checked."
     chances = "No chances were computed: they need declared errors, markers, and the arm."

@@ -23,7 +23,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report import palette
-from puncture_twin.twin.report.map_view import step_of
+from puncture_twin.twin.report.map_view import grid_step
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.render import Layer, Surface
 
@@ -78,7 +78,7 @@ def corridor(candidates: Candidates, case: Any) -> list[TriangleMesh]:
 
 def _cells(candidates: Candidates, case: Any, rows: Ints) -> tuple[Floats, Ints]:
     """Corner points (n, 3), shared between cells, and the four corners (m, 4) of the cells of some rows."""
-    half = step_of(candidates) / 2
+    half = grid_step(candidates) / 2
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     theta = np.clip(candidates.theta[rows, None] + half * signs[:, 0], 0.0, np.pi)
     beta = candidates.beta[rows, None] + half * signs[:, 1]
