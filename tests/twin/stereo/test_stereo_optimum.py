@@ -199,6 +199,30 @@ def test_what_no_camera_sees_stays(found):
     np.testing.assert_allclose(read.tip_covariance - plain.tip_covariance, 0.16 * np.eye(3), atol=1e-12)
 
 
+def test_of_an_arrival_an_image_of_the_ball_leaves_the_rotation_that_it_does_not_show(found):
+    """With all else known: the joints' error at an arrival, given the ball's shift, by differences and Schur."""
+    names = ("tip_offset_mm", "needle_direction_deg", "head_shift_mm", "head_turn_deg", "target_mm")
+    observed = found.model.observed
+    errors = observed.errors.model_copy(update=dict.fromkeys(names, 0.0))
+    model, x = replace(found.model, observed=replace(observed, errors=errors)), found.unknowns
+    known = replace(found, model=model, covariance=np.zeros_like(found.covariance))
+    by_joint = []
+    for step in 1e-4 * np.eye(6):
+        up, down = (model.rod_at(x, (observed.q_command[-1] + sign * step)[None]) for sign in (1, -1))
+        turned = log_rotation(up.R_base_flange[0] @ down.R_base_flange[0].T)
+        by_joint.append(np.concatenate([up.ball[0] - down.ball[0], turned]) / 2e-4)
+    J = np.kron(np.eye(2), (model.pose_of("head", x)[:3, :3].T @ model.pose_of("base", x)[:3, :3])) @ np.transpose(
+        by_joint
+    )
+    cov = errors.arrival**2 * J @ J.T
+    seen_ball = cov[:3, :3] + joint_model.FLOOR_MM**2 * np.eye(3)
+    left = cov[3:, 3:] - cov[3:, :3] @ np.linalg.solve(seen_ball, cov[:3, 3:])
+    told = seen(known, x.markers_m.mean(axis=0)).covariance
+    assert np.trace(left) > 0.01 * np.trace(cov[3:, 3:]) > 0.0
+    np.testing.assert_allclose(told[3:, 3:], left, atol=1e-4 * np.trace(left))
+    np.testing.assert_allclose(told[:3], 0.0, atol=1e-15)
+
+
 def test_without_errors_the_needle_is_where_it_is_believed():
     """A room of which everything is declared to be exact leaves some thousandths of a millimetre, and hits."""
     exact = CASE.errors.scaled(0.0).stated() | {"ball_px": 1e-3}
