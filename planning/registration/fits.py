@@ -20,7 +20,6 @@ from scipy.special import chdtrc, chdtri, fdtri
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_of_points, log_rotation, pose, skew
-from puncture_twin.planning.registration import fits
 
 NUDGE_MM = 1e-4
 """Of central differences of a method that has no formula of its own; their error is 1e-9 of the map."""
@@ -435,7 +434,7 @@ class Aim:
     q: Floats  # shape (6,), rad, the tip on the target
     arm_jacobian: Floats  # shape (6, 28), J_f: motion of the needle there per arm parameter, base axes
 
-    def response(self, noise: fits.ReadingNoise, weights: Floats) -> Floats:
+    def response(self, noise: ReadingNoise, weights: Floats) -> Floats:
         """Correction of the pose at the target per residual of weights W (..., 3 N, 3 N), shape (..., 6, 3 N).
 
         J_f Sigma_eta J' W, with Sigma_eta, J the arm's parameters and their effect on the touches.
