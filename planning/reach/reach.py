@@ -239,8 +239,8 @@ def check_motion(
         return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
     model = checker.model
     lengths = survey.request.needle_length_mm, survey.request.standoff_mm
-    line, branch, roll, rotation, _ = insertion
-    q, depths = sampled(checker.swept, line, branch, rotation, lengths, len(survey.depths), MAX_SWEEP_MM)
+    line, branch, roll, turn, _ = insertion
+    q, depths = sampled(checker.swept, line, branch, turn, lengths, len(survey.depths), MAX_SWEEP_MM)
     stop = first_stop(model, q, depths)
     if stop is not None:
         return Blocked(stop.depth_mm, stop.detail)
@@ -259,7 +259,7 @@ def sampled(
     swept: SweptBodies,
     line: NeedleLine,
     branch: int,
-    rotation: Floats,
+    turn: Floats,
     lengths_mm: tuple[float, float],
     samples: int,
     most_mm: float,
@@ -276,7 +276,7 @@ def sampled(
         most_mm: What no body's motion exceeds; see :meth:`SweptBodies.bounds_mm`.
     """
     bodies = swept.corners, swept.longest_lever_mm
-    q, depths = _sampled(swept.model.lengths, *line, branch, rotation, lengths_mm, samples, bodies, most_mm)
+    q, depths = _sampled(swept.model.lengths, *line, branch, turn, lengths_mm, samples, bodies, most_mm)
     return q, depths
 
 
