@@ -63,7 +63,7 @@ def check_inputs(plan: Plan, case: Case, path: Path) -> None:
 
 
 def check_geometry(plan: Plan, path: Path) -> None:
-    """Refuse a plan whose motion has a gap, starts elsewhere than at standoff, or ends off the target."""
+    """Refuse a motion with a gap, off the straight line from standoff to target, too fast, or beyond joint limits."""
     if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
         refuse("the insertion does not start where the approach ends", path, "connected phases", "phases_not_joined")
     _check_straight(plan, path)
@@ -83,7 +83,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
 
 
 def check_angles(plan: Plan, path: Path) -> None:
-    """Refuse a roll that is not that of the joint angles at standoff, and angles beyond a full circle."""
+    """Refuse a roll that is not that of the joint angles at standoff, theta beyond 180 degrees, beta beyond 360."""
     for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
         if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
             refuse(f"{name} = {np.degrees(angle):g}", path, f"0 to {np.degrees(turn):g}", "out_of_range")

@@ -1,4 +1,4 @@
-"""The sources of a needle's pose error: their names for people, and the key of ``[errors]`` states each."""
+"""The sources of a needle's pose error: their names for people, and the key of ``[errors]`` of each."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple

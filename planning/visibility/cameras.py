@@ -188,7 +188,7 @@ def candidate_pairs(T_ct_bed: Floats) -> tuple[Floats, Floats]:
 
 
 def hidden_by(surfaces: Surfaces, points_ct: Floats, cameras_ct: Floats, near_mm: float = 0.0) -> Names:
-    """Name of the surface that hides each point from each camera; of several by the first in the list.
+    """Name of the surface that hides any of the points from each camera; of several the first in the list.
 
     Args:
         points_ct: Shape (k, 3), mm.
