@@ -65,9 +65,9 @@ class ArmSpheres:
         trees = [sphere_tree(pieces, SPHERE_MM) for pieces in bodies]
         rows = [np.insert(tree.leaves, 0, 0) for tree in trees]  # row 0 is the root
         return cls(
-            np.concatenate([tree.centres[leaves] for tree, leaves in zip(trees, rows, strict=True)]),
-            np.concatenate([tree.radii[leaves] for tree, leaves in zip(trees, rows, strict=True)]),
-            np.cumsum([0] + [len(leaves) for leaves in rows]),
+            np.concatenate([tree.centres[own] for tree, own in zip(trees, rows, strict=True)]),
+            np.concatenate([tree.radii[own] for tree, own in zip(trees, rows, strict=True)]),
+            np.cumsum([0] + [len(own) for own in rows]),
             np.minimum(np.arange(len(trees)), FLANGE),
         )
 

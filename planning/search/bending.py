@@ -79,9 +79,9 @@ class Insertion(NamedTuple):
     def lines(self, greatest_mm: float) -> list[str]:
         """Lines of text for a person."""
         peak, free, pinned = self.force.peak_n, self.buckling_free_n, self.buckling_pinned_n
-        straight = f"{greatest_mm:.2f} mm are added to the margins"
+        added = f"{greatest_mm:.2f} mm are added to the margins"
         return [
-            f"  needle bends   {self.tip_mm:8.2f} mm at the tip if the bevel is never rotated; {straight}",
+            f"  needle bends   {self.tip_mm:8.2f} mm at the tip if the bevel is never rotated; {added}",
             f"  axial force    {peak:8.2f} N at most; the shaft buckles at {free:.1f} N, pinned at {pinned:.1f} N",
         ]
 
