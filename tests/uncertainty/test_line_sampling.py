@@ -12,6 +12,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine, near_faces
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.uncertainty import lines as module
 from puncture_twin.planning.uncertainty.hit import proximity, touch_chance
 from puncture_twin.planning.uncertainty.lines import Needles, refined
 
@@ -144,3 +145,25 @@ def test_near_faces_answer_as_the_engine_does(rng, kind):
     assert sure.any() or (whole < 3).any()
     np.testing.assert_allclose(quick[sure], whole[sure], atol=1e-9)
     assert (quick >= whole - 1e-9).all()
+
+
+def test_threads_change_no_bit(monkeypatch):
+    rng, count = np.random.default_rng(1), 24
+    outward = UP + rng.normal(scale=0.1, size=(count, 3))
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    engine = FastEngine([moved(box(40.0, 30.0, 50.0), 23.0, 0, 60.0), tube_of(4.0)])
+    axes = engine.measure(np.zeros(3), outward, LENGTH)
+    normal = normals_of(engine.triangles, np.zeros(3), outward, axes)
+    near = proximity(axes.distance, axes.depth, normal, outward, np.tile(LEAN, (count, 1, 1)), 0.0)
+    shape = axes.distance.shape
+    answers = []
+    for threads in (1, 8):
+        monkeypatch.setattr(module, "MOST_THREADS", threads)
+        monkeypatch.setattr("puncture_twin.planning.base.processes.worker_count", lambda wanted, _: wanted)
+        for draws in (module.many_lines, module.few_lines, module.error_sizes):
+            draws.cache_clear()  # so that threads make them side by side
+        needles = Needles(outward, np.tile(LEAN, (count, 1, 1)), near, np.zeros(shape), 6)
+        first, around = touch_chance(near, RADIUS, 6), (engine.blocks, np.full(shape, LENGTH), np.zeros(3))
+        answers.append(refined(*around, needles, np.full(shape[1], RADIUS), first, np.ones(shape, bool)))
+    assert (np.isfinite(answers[0]) & (answers[0] != first)).any(axis=1).sum() > count / 2
+    assert answers[0].tobytes() == answers[1].tobytes()
