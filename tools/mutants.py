@@ -69,10 +69,16 @@ PLAIN = MappingProxyType(
         ),
         "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{test}" for test in STANDOFF),
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
-        "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
-        "puncture_twin.planning.registration.marker_pairs": REGISTRATION,
+        "puncture_twin.planning.search.constraints": (
+            "tests/search/test_verdict_order.py",
+            "tests/search/test_windows.py",
+        ),
+        "puncture_twin.planning.registration.marker_pairs": (
+            *REGISTRATION,
+            "tests/registration/test_marker_ambiguity.py",
+        ),
         "puncture_twin.planning.registration.fits": REGISTRATION,
-        "puncture_twin.planning.registration.registration": REGISTRATION,
+        "puncture_twin.planning.registration.registration": (*REGISTRATION, "tests/registration/test_distortion.py"),
     }
 )
 """All mutants of these, and the tests that must notice them."""
