@@ -70,7 +70,7 @@ class ClearanceScale(NamedTuple):
 
 
 def clearance_scale(candidates: Candidates) -> ClearanceScale:
-    """Range of the clearances of the safe directions; infinite where none has a margin."""
+    """Range of the clearances of the safe directions; infinite where none of them has a finite one."""
     values = candidates.least_clearance[candidates.safe]
     values = values[np.isfinite(values)]
     if len(values) == 0:

@@ -49,7 +49,7 @@ class DeclaredArm(NamedTuple):
         return sigma
 
     def motions(self, q: Floats, turn: Floats) -> FlangeMotions:
-        """Motions of the flange by the arm's errors at joints (n, 6), rad, that rotated last by signs (n, 6)."""
+        """Motions of the flange by the arm's errors at joints (n, 6), rad; ``turn`` (n, 6): last signs, 0 unknown."""
         J, half = error_jacobian(self.model, q, 0.0), self.errors.backlash / 2
         slopes, joints = J[..., :N_ARM] * self.deviations(), J[..., ARM_PARAMETERS["joint"]]
         play = -half * joints * turn[:, None, :]  # -half the width times the direction of rotation
