@@ -75,16 +75,18 @@ LAYOUT = Layout(
     GROUPS,
     any_of=(frozenset({"A", "q"}),),
     one_of=frozenset({"P_mm", "P_px", "picture"}),
-    needs={
-        "P_w": "P_mm",
-        "v_z": "v",
-        "shaft": "v",
-        "frame": "picture",
-        "pixel": "picture",
-        "turn": "q",
-        "A": "B",
-        "B": "A",
-    },
+    needs=MappingProxyType(
+        {
+            "P_w": "P_mm",
+            "v_z": "v",
+            "shaft": "v",
+            "frame": "picture",
+            "pixel": "picture",
+            "turn": "q",
+            "A": "B",
+            "B": "A",
+        }
+    ),
 )
 """Poses or joints, and one of three statements of where the tip is."""
 COVERED = "something coloured covers the needle's tip"
