@@ -22,7 +22,7 @@ from time import monotonic
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "out" / "versions"
-CASE = "meshes/carton/case_m.toml"
+CASE = "meshes/abdomen"
 ROOMS = ("tests/base", "tests/case")
 """What leans on Python's own library: processes, files, pickles, TOML, text. Numbers are the search's, and NumPy's."""
 
@@ -142,11 +142,9 @@ def main() -> int:
     here = Environment("here", sys.executable, ())
     tried = environments(OUT)
     try:
-        with ThreadPoolExecutor(1 + len(tried)) as pool:  # pip waits for others, and the search here need not wait
-            search = [sys.executable, "run_twin.py", "search", CASE, "--no-pictures", "--out", str(OUT / "here")]
-            searched = pool.submit(_run, here, search)
+        with ThreadPoolExecutor(len(tried) or 1) as pool:
             tables = list(pool.map(lambda one: try_out(one, OUT), tried))
-            searched.result()
+        _run(here, [sys.executable, "run_twin.py", "search", CASE, "--no-pictures", "--out", str(OUT / "here")])
     except FailedError as error:
         print(error, file=sys.stderr)
         return 1
