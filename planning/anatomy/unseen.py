@@ -302,21 +302,24 @@ def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = 
         beyond += (ends - plane) * [[-1], [1]] > 0
     within = plane != np.array([np.zeros(3), shape]) - [[0], [1]]
     cut = within & ((weight >= FEWEST_FLAT) | ((pooled_weight >= FEWEST_FLAT) & (pooled_weight > beyond)))
-    cut |= within & (cut & (pooled >= FEWEST_FLAT)).any() & (weight > 0)
+    cut |= within & (cut & (pooled >= FEWEST_FLAT)).any() & (count > 0)
     return plane + [[-0.5], [0.5]], np.where(cut, pooled, 0)
 
 
 def _outermost(ends: LabelEnds) -> tuple[Ints, Ints, Ints]:
     """A map's outermost slices; how many of its labels end flat there, and as how many they count: shapes (2, 3).
 
-    A label that ends flat on both sides along two axes is a block, drawn so, and counts as none.
+    A label that ends flat on both sides along two axes is a block, drawn so, or an organ that fills a crop: it counts
+    where another label ends flat in its plane.
     """
     plane = np.stack([ends.last.min(axis=0)[:, 0], ends.last.max(axis=0)[:, 1]])
-    block = np.count_nonzero(ends.flat_mm2.all(axis=2), axis=1) >= 2
-    flat_mm2 = np.where((ends.last == plane.T) & ~block[:, None, None], ends.flat_mm2, 0.0)
+    block = (np.count_nonzero(ends.flat_mm2.all(axis=2), axis=1) >= 2)[:, None, None]
+    flat_mm2 = np.where(ends.last == plane.T, ends.flat_mm2, 0.0)
+    count = np.count_nonzero(flat_mm2, axis=0).T
+    flat_mm2 = np.where(block & ~((flat_mm2 > 0.0) & ~block).any(axis=0), 0.0, flat_mm2)
     alone = (flat_mm2 >= ORGAN_MM2) & (ends.flat_mm2[:, :, ::-1] == 0.0)
     weight = np.where(alone, FEWEST_FLAT, flat_mm2 > 0.0).sum(axis=0).T
-    return plane, np.count_nonzero(flat_mm2, axis=0).T, weight
+    return plane, count, weight
 
 
 def _near_body(case: Case, skin: TriangleMesh, voxels: VolumeGrid, margin_mm: float, memory: Memory) -> Floats:

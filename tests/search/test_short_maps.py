@@ -249,6 +249,16 @@ def test_blocks_that_somebody_drew_were_not_cut():
     assert cut_off(LabelEnds(last, 300.0 * slab), (99, 99, 99))[1].tolist() == [[0, 0, 2], [0, 0, 2]]
 
 
+def test_an_organ_that_fills_a_crop_counts_where_another_is_cut_with_it():
+    """Of a map about a lesion: the liver is flat all around, ribs at one side; then at every side where it was cut."""
+    last = np.array([[[20, 60]] * 3, [[20, 35], [25, 40], [25, 45]]])
+    liver, ribs = np.full((3, 2), 3000.0), np.zeros((3, 2))
+    assert not cut_off(LabelEnds(last[:1], liver[None]), (99, 99, 99))[1].any()  # alone: a block that somebody drew
+    ribs[0, 0] = 150.0
+    flat = cut_off(LabelEnds(last, np.array([liver, ribs])), (99, 99, 99))[1]
+    assert flat.tolist() == [[2, 1, 1], [1, 1, 1]]
+
+
 def test_of_many_maps_with_a_label_each_two_may_end_flat_in_one_slice():
     """Where more maps go on beyond it; the last three are one label each, in a plane of their own."""
     pair = [LabelEnds(np.full((1, 3, 2), 40), np.array([[[area_mm2, 0.0]] * 3])) for area_mm2 in (300.0, 310.0)]
