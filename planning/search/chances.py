@@ -236,13 +236,10 @@ def with_chances(
     rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.arm.q_insertion).all(axis=1))
     if model is None or not len(rows):
         return replace(candidates, chances=Chances.unknown(names, len(candidates)))
-    parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
-    measured = [None if axes is None else axes.at(part) for part in parts]
-    outward, q = candidates.outward_ct, candidates.arm.q_insertion
-    computed = [model.chances(outward[part], q[part], of) for part, of in zip(parts, measured, strict=True)]
-    chances = Chances.unknown(names, len(candidates))
-    for part, of_part in zip(parts, computed, strict=True):
-        chances = chances.with_rows(part, of_part)
+    outward, q, chances = candidates.outward_ct, candidates.arm.q_insertion, Chances.unknown(names, len(candidates))
+    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
+        measured = None if axes is None else axes.at(part)
+        chances = chances.with_rows(part, model.chances(outward[part], q[part], measured))
     return limited(case, refined_near_limits(replace(candidates, chances=chances), model))
 
 
