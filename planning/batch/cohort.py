@@ -1,8 +1,6 @@
 """The cases of a cohort: a folder, a CSV, or a TOML file with patterns of cases and a grid of options for each."""
 
-import csv
 import glob
-import io
 import math
 import os
 import re
@@ -16,12 +14,13 @@ from typing import Annotated, Any, NoReturn
 from pydantic import Field
 
 from puncture_twin.planning.base.errors import InputError, one_line, refuse
-from puncture_twin.planning.base.files import decode_text, is_folder, read_input
+from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
 from puncture_twin.planning.case.case_file import NO_OPTIONS, SECTIONS, CaseOptions, case_options
 from puncture_twin.planning.case.tables import Section, Text
+from puncture_twin.planning.formats.csv_table import CsvLine, csv_lines
 
 CASE_FILE = "case.toml"
 ALLOWED = f"a folder with {CASE_FILE} files, a CSV with the header 'case', or a cohort.toml"
@@ -94,41 +93,31 @@ def _refuse_unreadable(error: OSError) -> NoReturn:
 
 CASE, NAME, TARGET = "case", "name", "target"
 ALLOWED_COLUMNS = f"{CASE}, {NAME}, {TARGET}, and options as KIND.KEY (KIND one of {', '.join(SECTIONS)})"
-LONGEST_CELL = 20_000
 
 
 def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
-    """The cases that a CSV lists; what cannot be used is refused with its line."""
-    rows = _rows(content, path)
-    header = _header(next(rows, []), path)
+    """The cases that a CSV lists; what cannot be used is refused with its line. # is no comment: a path may have it."""
+    lines = csv_lines(content, str(path), ALLOWED_COLUMNS, mark=None)
+    header = _header(next(lines, CsvLine(1, [])), path)
     cases = []
-    for row in rows:
-        where = f"{path}: line {rows.line_num}"
-        if not any(row):
-            continue
+    for line, row in lines:
+        where = f"{path}: line {line}"
         if len(row) != len(header):
             refuse(f"{len(row)} cells", where, f"{len(header)}, as in the header", "ragged_row")
         cases.append(_case(dict(zip(header, row, strict=True)), path, where))
     return cases
 
 
-def _rows(content: bytes, path: Path) -> Any:
-    text = decode_text(content, str(path))
-    if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
-        refuse("is not a CSV file", path, f"text, lines of at most {LONGEST_CELL} characters", "not_csv")
-    return csv.reader(io.StringIO(text), strict=False)
-
-
-def _header(row: list[str], path: Path) -> list[str]:
-    header = [cell.strip() for cell in row]
+def _header(line: CsvLine, path: Path) -> list[str]:
+    header, where = [cell.strip() for cell in line.fields], f"{path}: line {line.line}"
     if CASE not in header:
-        refuse(f"has no column '{CASE}'", f"{path}: line 1", ALLOWED_COLUMNS, "missing_column")
+        refuse(f"has no column '{CASE}'", where, ALLOWED_COLUMNS, "missing_column")
     for name in header:
         kind, _, key = name.partition(".")
         if name not in (CASE, NAME, TARGET) and not (kind in SECTIONS and key):
-            refuse(f"column '{name}' is not known", f"{path}: line 1", ALLOWED_COLUMNS, "unknown_column")
+            refuse(f"column '{name}' is not known", where, ALLOWED_COLUMNS, "unknown_column")
         if header.count(name) > 1:
-            refuse(f"column '{name}' appears twice", f"{path}: line 1", "each column once", "duplicate_column")
+            refuse(f"column '{name}' appears twice", where, "each column once", "duplicate_column")
     return header
 
 

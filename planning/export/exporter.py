@@ -3,8 +3,6 @@
 Other packages add formats by the entry point group `GROUP`; what they write is held to the same.
 """
 
-import csv
-import io
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,6 +24,7 @@ from puncture_twin.planning.export import program as programs
 from puncture_twin.planning.export.program import SampledMotion, check_sampled, heading
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
+from puncture_twin.planning.formats.csv_table import columns_fault, csv_lines, row_numbers
 from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
@@ -110,19 +109,15 @@ def csv_text(plan: Plan, *, case_checked: bool) -> str:
 
 def read_csv(text: str, *, where: Path) -> SampledMotion:
     """Read such a CSV back; what is no motion is refused."""
-    rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
-    if not rows or tuple(rows[0]) != COLUMNS:
-        refuse("the table has another header", where, ",".join(COLUMNS), "wrong_columns")
+    lines = list(csv_lines(text.encode(), str(where), ",".join(COLUMNS)))
+    if fault := columns_fault(lines[0].fields if lines else (), COLUMNS):
+        refuse(f"the header {fault}", where, ",".join(COLUMNS), "wrong_columns")
     phases: dict[str, list[list[float]]] = {phase: [] for phase in SampledMotion._fields}
-    for number, row in enumerate(rows[1:], start=2):
-        try:
-            phases[row[0]].append([float(cell) for cell in row[1:]])
-        except (KeyError, IndexError, ValueError) as error:
-            allowed = f"{' or '.join(phases)} and seven numbers"
-            what = f"row {number} of the table: {error}"
-            raise InputError(what, where=where, allowed=allowed, code="not_a_number") from error
-        if len(row) != len(COLUMNS):
-            refuse(f"row {number} has {len(row)} cells", where, f"{len(COLUMNS)} cells", "ragged_row")
+    for line, fields in lines[1:]:
+        place = f"{where}, line {line}"
+        if fields[0] not in phases:
+            refuse(f"phase {fields[0][:40]!r}", place, " or ".join(phases), "unknown_name")
+        phases[fields[0]].append(row_numbers(fields, COLUMNS, COLUMNS[1:], place))
     tables = [np.array(table).reshape(-1, 7) for table in phases.values()]
     return SampledMotion(*(Trajectory(table[:, 0], table[:, 1:]) for table in tables))
 

@@ -1,8 +1,9 @@
 """CSV tables: lines, numbers, and tables whose columns come in groups, such as the twelve of a pose.
 
-A table is read whole, or refused with file and line. The first column names the row; groups follow it in a fixed
-order, each whole or absent. Lines that start with # are passed over. A pose is nine numbers of its rotation, by rows,
-and its place in mm.
+A table is read whole, or refused with file and line. What is no row is passed over: lines that start with #, empty
+ones, and those of nothing but commas, as spreadsheets write them. In a table with groups the first column names the
+row; groups follow it in a fixed order, each whole or absent. A pose is nine numbers of its rotation, by rows, and its
+place in mm.
 """
 
 import csv
@@ -22,6 +23,9 @@ from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.geometry.rigid import pose
 
+MOST_NAMED = 8
+"""Columns that a refusal names at most of a kind."""
+
 
 class CsvLine(NamedTuple):
     """A line of a CSV: its number in the file, from 1, and its fields."""
@@ -30,16 +34,62 @@ class CsvLine(NamedTuple):
     fields: list[str]
 
 
-def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
-    """The lines of a CSV that are not empty. Raises InputError: it is none; names the line, and what is ``allowed``."""
-    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
+class _Uncommented(Iterator[str]):
+    """The lines of a text without its comments: lines between two rows that start with #."""
+
+    def __init__(self, text: str, where: str, mark: str | None) -> None:
+        self._mark = mark  # of a comment
+        self._lines = enumerate(io.StringIO(text, newline=""), start=1)
+        self._where = where
+        self.number = 0  # of the line given last
+        self.within = False  # whether that line's row, which may have line breaks in quotes, has not ended
+        self.width = 0  # fields of a row whose first may be any name; 0 where none may start with #
+
+    def __next__(self) -> str:
+        for number, line in self._lines:
+            self.number = number
+            if self.within or line.lstrip()[:1] != self._mark:
+                self.within = True
+                return line
+            if 0 < self.width <= line.rstrip(", \t\r\n").count(",") + 1:
+                allowed = "comments with fewer fields, or the name in quotes where it is a row"
+                where = f"{self._where}, line {self.number}"
+                refuse("starts with # like a comment, but has the fields of a row", where, allowed, "comment_or_row")
+        raise StopIteration
+
+
+def csv_lines(
+    data: bytes, where: str, allowed: str, *, named: bool = False, blanks: bool = False, mark: str | None = "#"
+) -> Iterator[CsvLine]:
+    """The header and the rows of a CSV; comments (#), empty lines and lines of nothing but commas are passed over.
+
+    Args:
+        named: The first column may hold any name: what may be a row or a comment is refused.
+        blanks: Where the header has no comma, blanks separate the fields.
+        mark: What a comment starts with; None where a row may start with any, such as that of a path.
+
+    Raises:
+        InputError: It is no CSV; names the line, and what is ``allowed``.
+    """
+    text = decode_text(data, where)
+    lines = _Uncommented(text, where, mark)
+    header = next((line for line in text.splitlines() if line.strip() and line.lstrip()[0] != mark), "")
+    by_blanks = blanks and "," not in header
+    rows = (line.split() for line in lines) if by_blanks else csv.reader(lines, strict=True)
     try:
-        for fields in reader:
-            if any(field.strip() for field in fields):
-                yield CsvLine(reader.line_num, fields)
+        for fields in rows:
+            lines.within = False
+            if any(field.strip() for field in fields) and not _is_comment(fields, mark):
+                lines.width = lines.width or named * len(fields)
+                yield CsvLine(lines.number, fields)
     except csv.Error as error:
-        place = f"{where}, line {reader.line_num}"
+        place = f"{where}, line {lines.number}"
         raise InputError(f"is not a CSV file ({error})", where=place, allowed=allowed, code="not_csv") from error
+
+
+def _is_comment(fields: Sequence[str], mark: str | None) -> bool:
+    """Whether these are a comment as a spreadsheet writes it: in one cell, in quotes if it holds a comma."""
+    return fields[0].lstrip()[:1] == mark and not any(field.strip() for field in fields[1:])
 
 
 def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str], where: str) -> list[float]:
@@ -71,11 +121,38 @@ class Layout(NamedTuple):
     one_of: frozenset[str] = frozenset()  # of these exactly one, where there are any
     needs: Mapping[str, str] = MappingProxyType({})  # a group, and the one without which it does not stand
 
-    def allows(self, present: set[str]) -> bool:
-        """True where these groups belong together."""
-        whole = all(need in present for group, need in self.needs.items() if group in present)
-        enough = all(present & some for some in self.any_of)
-        return whole and enough and (not self.one_of or len(present & self.one_of) == 1)
+    def fault(self, present: Sequence[str]) -> str:
+        """Why these groups, in the file's order, do not belong together; empty where they do."""
+        lacking = [some for some in self.any_of if not some.intersection(present)]
+        lacking += [frozenset({need}) for group, need in self.needs.items() if group in present and need not in present]
+        one = [group for group in present if group in self.one_of]
+        lacking += [self.one_of] if self.one_of and not one else []
+        if lacking:
+            return f"lacks {self._columns([group for group in self.groups if group in lacking[0]], ' or ')}"
+        return f"has {self._columns(one, ' and ')} at once" if len(one) > 1 else ""
+
+    def _columns(self, groups: Sequence[str], between: str) -> str:
+        return between.join(some_names(self.groups[group]) for group in groups)
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Names in one line; of more than ``MOST_NAMED`` the first and the last."""
+    return ", ".join(names) if len(names) <= MOST_NAMED else f"{', '.join(names[: MOST_NAMED - 1])} .. {names[-1]}"
+
+
+def columns_fault(header: Sequence[str], wanted: Sequence[str]) -> str:
+    """What a header lacks, has unasked, has twice or has in another order than is wanted; empty where it is that."""
+    if tuple(header) == tuple(wanted):
+        return ""
+    lacks = [name for name in wanted if name not in header]
+    placed = [(f"{name[:40]!r} (column {at})", name) for at, name in enumerate(header, start=1)]
+    unknown = [place for place, name in placed if name not in wanted]
+    again = [place for at, (place, name) in enumerate(placed) if name in wanted and name in header[:at]]
+    faults = ("lacks", lacks), ("has the unknown", unknown), ("repeats", again)
+    if found := [f"{verb} {some_names(names)}" for verb, names in faults if names]:
+        return "; ".join(found) if header else "is missing"
+    place, belongs = next((place, name) for (place, own), name in zip(placed, wanted, strict=True) if own != name)
+    return f"has {place} where {belongs} belongs"
 
 
 class GroupedTable(NamedTuple):
@@ -107,16 +184,13 @@ def parse_table(
     allowed = ", ".join((first, *(column for group in example for column in groups[group])))
     lines = [line for line in csv_lines(content, str(path), allowed) if not line.fields[0].startswith("#")]
     header = tuple(field.strip() for field in lines[0].fields) if lines else ()
-    present, at = [], 1
-    for group, columns in groups.items():
-        if header[at : at + len(columns)] == columns:
-            present.append(group)
-            at += len(columns)
-    if header[:1] != (first,) or at != len(header) or not layout.allows({*present}):
-        refuse(f"columns {', '.join(header)[:200] or 'none'}", f"{path}, header", allowed, "wrong_columns")
+    present = [group for group, columns in groups.items() if {*columns} & {*header}]
+    wanted = (first, *(column for group in present for column in groups[group]))
+    if faults := [fault for fault in (columns_fault(header, wanted), layout.fault(present)) if fault]:
+        refuse(f"the header {'; '.join(faults)}", path, allowed, "wrong_columns")
     plain = [group for group in present if group not in texts]
-    wanted = [column for group in plain for column in groups[group]]
-    rows = [row_numbers(fields, header, wanted, f"{path}, line {line}") for line, fields in lines[1:]]
+    numeric = [column for group in plain for column in groups[group]]
+    rows = [row_numbers(fields, header, numeric, f"{path}, line {line}") for line, fields in lines[1:]]
     if not rows:
         refuse("no row", path, "one row or more", "empty")
     parts = np.split(np.array(rows), np.cumsum([len(groups[group]) for group in plain])[:-1], axis=1)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import InputError, refuse, refusing
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic, decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import Facts, Shown, brief
@@ -116,9 +116,11 @@ def write_points(path: Path, points: NamedPoints) -> None:
     header += [] if points.joints is None else JOINTS_DEG
     labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
     numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
-    rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
+    rows = [[*label, *row] for label, row in zip(labels, numbers.tolist(), strict=True)]
+    hidden = any(name.lstrip().startswith("#") for name in points.names)  # without quotes such a row is a comment
     with atomic(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([header, *rows])
+        quoted = csv.writer(file, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
+        (quoted if hidden else csv.writer(file, lineterminator="\n")).writerows([header, *rows])
 
 
 def parse_triple(text: str, where: str, allowed: str = "X,Y,Z in mm") -> tuple[float, float, float]:
@@ -147,8 +149,8 @@ _ALLOWED = (
 
 
 def read_csv_points(data: bytes, where: str) -> RawPoints:
-    """The points of a CSV file, in the order of its lines; empty lines are passed over."""
-    rows = list(csv_lines(data, where, _ALLOWED))
+    """The points of a CSV file, in the order of its lines."""
+    rows = list(csv_lines(data, where, _ALLOWED, named=True))
     if not rows:
         refuse("no line", where, _ALLOWED, "empty")
     header = [field.strip() for field in rows[0].fields]
@@ -240,14 +242,8 @@ def read_fcsv_points(data: bytes, where: str) -> RawPoints:
     if any(columns.count(name) != 1 for name in ("x", "y", "z", "label")):
         refuse(f"columns {columns}", where, _FCSV_ALLOWED, "wrong_columns")
     names, points = [], []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
+    for number, fields in csv_lines(data, where, _FCSV_ALLOWED):
         place = f"{where}, line {number}"
-        try:
-            fields = next(csv.reader([line], strict=True))
-        except csv.Error as error:
-            raise InputError(f"{error}", where=place, allowed=_FCSV_ALLOWED, code="not_csv") from error
         if len(fields) - len(columns) not in (0, 2):
             refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED, "ragged_row")
         if (status := (*fields, _FCSV_DEFINED)[len(columns)]) != _FCSV_DEFINED:
@@ -329,16 +325,14 @@ def plainly_radians(angles_deg: ArrayLike) -> bool:
 
 
 def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecording:
-    """The joints of a CSV: a header, then a row a pose; other columns and lines with # do not count.
+    """The joints of a CSV: a header, then a row a pose; other columns do not count.
 
-    Separated by commas, or by spaces as RTDE's own client writes it. ``timed``: whether it must hold times.
+    Separated by commas, or by blanks as RTDE's own client writes it. ``timed``: whether it must hold times, which rise
+    within each phase where there is a column ``phase``, as in a plan that was exported.
     Raises InputError: a column is missing, something is no number, or the angles or times are of no arm.
     """
-    lines = [line for line in decode_text(data, str(path)).splitlines() if line.strip() and not line.startswith("#")]
-    comma = bool(lines) and "," in lines[0]
-    with refusing(csv.Error, "is not a CSV file", path, _ALLOWED_JOINTS, "not_csv"):
-        rows = list(csv.reader(lines, strict=True)) if comma else [line.split() for line in lines]
-    header = [cell.strip().strip('"') for cell in rows[0]] if rows else []
+    lines = list(csv_lines(data, str(path), _ALLOWED_JOINTS, blanks=True))
+    header = [cell.strip().strip('"') for cell in lines[0].fields] if lines else []
     kinds: list[tuple[tuple[str, ...], AngleUnit]] = [(JOINTS_RAD, "rad"), (JOINTS_DEG, "deg"), (RTDE_JOINTS, "rad")]
     joints, unit = max(kinds, key=lambda kind: sum(name in header for name in kind[0]))
     missing = [name for name in joints if name not in header]
@@ -348,22 +342,27 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     time = next((name for name in TIMES if name in header), None)
     if timed and time is None:
         refuse(f"lacks {' or '.join(TIMES)}", path, _ALLOWED_JOINTS, "missing_column")
-    if len(rows) < 2:
+    rows = lines[1:]
+    if not rows:
         refuse("has no row", path, _ALLOWED_JOINTS, "empty")
     tool = RTDE_TOOL if set(RTDE_TOOL) <= set(header) else ()
     torques = next((names for names in TORQUES if set(names) <= set(header)), ())
     wanted = [*joints, *([time] if time else []), *torques, *tool]
-    table = np.array([row_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])
-    names = tuple(row[header.index("name")].strip() for row in rows[1:]) if "name" in header else ()
+    table = np.array([row_numbers(fields, header, wanted, f"{path}, line {line}") for line, fields in rows])
+    names, phases = (
+        tuple(fields[header.index(column)].strip() for _, fields in rows) if column in header else ()
+        for column in ("name", "phase")
+    )
     q = joint_readings(table[:, :6], unit, where=path, names=names)
     times = table[:, 6] if time else None
     if times is not None:
-        back = np.flatnonzero(np.diff(times) < 0.0)
+        begins = np.array(phases[1:]) != np.array(phases[:-1]) if phases else False
+        back = np.flatnonzero((np.diff(times) < 0.0) & ~np.asarray(begins))
         if len(back):
             row = int(back[0])
-            what = f"row {row + 2}: time goes backwards, from {times[row]:g} to {times[row + 1]:g} s"
-            refuse(what, path, "rows in order of time", "times_not_rising")
-    names = names or tuple(str(i) for i in range(1, len(rows)))
+            what = f"time goes backwards, from {times[row]:g} to {times[row + 1]:g} s"
+            refuse(what, f"{path}, line {rows[row + 1].line}", "rows in order of time", "times_not_rising")
+    names = names or tuple(str(i) for i in range(1, len(lines)))
     torque_nm = table[:, 6 + bool(time) :][:, :6] if torques else None
     return JointRecording(names, q, times, 1000.0 * table[:, -3:] if tool else None, torque_nm)
 

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from puncture_twin.planning.base.arguments import checked_degrees, is_kind, shown_value
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
-from puncture_twin.planning.base.files import decode_text, read_input, unfinished_warnings
+from puncture_twin.planning.base.files import read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
-from puncture_twin.planning.formats.csv_table import csv_lines, parse_coordinate
+from puncture_twin.planning.formats.csv_table import CsvLine, columns_fault, csv_lines, row_numbers
 from puncture_twin.planning.formats.points import (
     MAX_FILE_BYTES,
     parse_points,
@@ -207,6 +207,7 @@ def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
 
 ANGLES = ("theta_deg", "beta_deg")
 ALLOWED_ANGLES = "a header with theta_deg, beta_deg and optionally name; then the same number of fields in every line"
+ALLOWED_ENTRIES = f"points (a header name,x_mm,y_mm,z_mm), or {ALLOWED_ANGLES}"
 GREATEST = (180.0, 360.0)
 """The largest θ and β, degrees."""
 
@@ -238,8 +239,11 @@ def read_entries(path: Path, case: Case) -> ReadList:
         InputError: A file that cannot be read, or a line that is none; names the line.
     """
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-    if path.suffix.lower() == ".csv" and set(ANGLES) & set(_header(data, path)):
-        return _list("entries", path, data, _angle_rows(data, path))
+    if path.suffix.lower() == ".csv":
+        lines = csv_lines(data, str(path), ALLOWED_ENTRIES, named=True)
+        header = next(lines, None)
+        if header is not None and set(ANGLES) & {field.strip() for field in header.fields}:
+            return _list("entries", path, data, _angle_rows([header, *lines], path))
     points = _points(data, path, case)
     return _list("entries", path, data, [one._replace(choice=Choice(entry_mm=one.point_mm)) for one in points])
 
@@ -262,29 +266,22 @@ def _points(data: bytes, path: Path, case: Case) -> list[Listed]:
     return [Listed(number, name, (x, y, z), Choice()) for number, (name, (x, y, z)) in named]
 
 
-def _header(data: bytes, path: Path) -> list[str]:
-    lines = decode_text(data, str(path)).splitlines()
-    return [field.strip() for field in (lines[0] if lines else "").split(",")]
-
-
-def _angle_rows(data: bytes, path: Path) -> list[Listed]:
-    header = _header(data, path)
-    if sorted(header) not in (sorted(ANGLES), sorted((*ANGLES, "name"))):
-        refuse(f"columns {header}"[:200], f"{path}, header", ALLOWED_ANGLES, "wrong_columns")
-    lines = list(csv_lines(data, str(path), ALLOWED_ANGLES))[1:]
-    if not lines:
+def _angle_rows(lines: Sequence[CsvLine], path: Path) -> list[Listed]:
+    header = [field.strip() for field in lines[0].fields]
+    wanted = {*ANGLES} | ({*header} & {"name"})  # in any order
+    if fault := columns_fault(header, sorted(wanted, key=lambda name: (*header, name).index(name))):
+        refuse(f"the header {fault}", path, ALLOWED_ANGLES, "wrong_columns")
+    if len(lines) < 2:
         refuse("no line", path, ALLOWED_ANGLES, "empty")
     rows = []
-    for number, (line, fields) in enumerate(lines, 1):
+    for number, (line, fields) in enumerate(lines[1:], 1):
         where = f"{path}, line {line}"
-        if len(fields) != len(header):
-            refuse(f"{len(fields)} fields instead of {len(header)}", where, ALLOWED_ANGLES, "ragged_row")
-        stated = dict(zip(header, (field.strip() for field in fields), strict=True))
-        theta, beta = (parse_coordinate(stated[name], where) for name in ANGLES)
+        theta, beta = row_numbers(fields, header, ANGLES, where)
         for name, angle, most in zip(ANGLES, (theta, beta), GREATEST, strict=True):
             if not 0.0 <= angle <= most:
                 refuse(f"{name} {angle:g}", where, f"0 to {most:g}", "out_of_range")
-        rows.append(Listed(number, stated.get("name", ""), None, parse_choice(theta, beta, None, None, None)))
+        name = fields[header.index("name")].strip() if "name" in header else ""
+        rows.append(Listed(number, name, None, parse_choice(theta, beta, None, None, None)))
     return rows
 
 

@@ -83,7 +83,9 @@ def test_a_target_is_a_point_or_a_name(tmp_path, cell, option):
         ("case\n", "cohort_size"),
         ("", "file_size"),
         ("case,name\n,b\n", "bad_name"),
-        ("case\na\0b\n", "not_csv"),
+        ("case\na\0b\n", "bad_name"),
+        ('case\na"b\n"c\n', "not_csv"),
+        ("\n,\ncase\ra\rb,c\r", "ragged_row line 5"),
         ("case,needle.length_mm\na,nan\n", "bad_value"),
     ],
 )

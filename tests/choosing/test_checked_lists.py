@@ -59,6 +59,11 @@ def test_angles_are_a_list_of_entries_too(context, tmp_path, run, capfd):
     assert [row["path_length_mm"] for row in told["rows"]] == pytest.approx(found.path.length[found.ranked[:3]])
     assert main(command) == OK
     assert len([line for line in capfd.readouterr().out.splitlines() if line.split()[1:2] == ["safe"]]) == 3
+    write(tmp_path / "angles.csv", "# of a sheet, by hand", "", '"beta_deg","theta_deg","name"', ",,",
+          *(f'{",".join(reversed(line.split(",")))},"#{number}"' for number, line in enumerate(lines)))  # fmt: skip
+    code, quoted = run(*command)
+    assert [row["name"] for row in quoted["rows"]] == ["#0", "#1", "#2"]
+    assert [row["path_length_mm"] for row in quoted["rows"]] == [row["path_length_mm"] for row in told["rows"]]
 
 
 def test_each_target_is_what_a_case_with_that_target_says(context, another, tmp_path, run):
@@ -90,7 +95,9 @@ def test_each_target_is_what_a_case_with_that_target_says(context, another, tmp_
         (("name,x,y,z", "a,1,2,3"), "unit_not_stated"),
         (("theta_deg,beta_deg", "1,2", "", "181,2"), "out_of_range line 4 theta_deg 181"),
         (("theta_deg,beta_deg", "1,2,3"), "ragged_row line 2"),
-        (("theta_deg,beta_deg,colour", "1,2,3"), "wrong_columns header"),
+        (("theta_deg,beta_deg,colour", "1,2,3"), "wrong_columns header colour (column 3)"),
+        (("theta_deg,name", "1,2"), "wrong_columns header lacks beta_deg"),
+        (("", "theta_deg,beta_deg", "1,2", "# 3,4"), "comment_or_row line 4"),
         (("theta_deg,beta_deg",), "empty"),
     ],
 )

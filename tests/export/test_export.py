@@ -693,7 +693,7 @@ SAMPLED = {"ros2": (ros2_text, partial(read_ros2, model=UR3), 1e-9), "csv": (csv
         ),
         ("ros2", lambda t: t + "    - {}\n", "wrong_format"),
         ("csv", lambda t: t.replace("q1_rad,q2_rad", "q2_rad,q1_rad"), "wrong_columns"),
-        ("csv", lambda t: t + "retraction,0,0,0,0,0,0,0\n", "not_a_number retraction"),
+        ("csv", lambda t: t + "retraction,0,0,0,0,0,0,0\n", "unknown_name retraction"),
         ("csv", lambda t: t + "insertion,99,0,0,0,0,0\n", "ragged_row"),
         ("csv", lambda t: t + "insertion,x,0,0,0,0,0,0\n", "not_a_number"),
         ("csv", lambda t: t + "insertion,99,0,0,0,0,0,0\n", "not_read_back"),

@@ -86,8 +86,21 @@ def test_times_that_run_backwards_are_refused():
     parse_joint_recording(written(["time_s", *JOINTS_RAD], np.column_stack([times, q])), FILE, timed=True)
     times[4] = 0.25
     table = written(["time_s", *JOINTS_RAD], np.column_stack([times, q]))
-    with refused("times_not_rising"):
+    with refused("times_not_rising", "line 6"):
         parse_joint_recording(table, FILE, timed=True)
+
+
+def test_times_begin_again_with_each_phase():
+    """As in an exported plan, whose insertion starts when the operator says so; within a phase they rise."""
+    q = np.radians(POSES)
+    lines = written(["time_s", *JOINTS_RAD], np.column_stack([[0, 1, 2, 3, 0, 1, 2, 3, 4], q])).decode().split()
+    phases = ["phase", *["approach"] * 4, *["insertion"] * 5]
+    table = "\n".join(f"{phase},{line}" for phase, line in zip(phases, lines, strict=True))
+    read = parse_joint_recording(table.encode(), FILE, timed=True)
+    np.testing.assert_allclose(read.q, q, atol=1e-8)
+    assert read.time_s.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 4]
+    with refused("times_not_rising", "line 6"):
+        parse_joint_recording(table.replace("insertion", "approach").encode(), FILE, timed=True)
 
 
 def test_a_list_of_touches_has_the_same_gate():

@@ -199,7 +199,7 @@ def test_a_local_frame_a_missing_file_and_a_directory_are_refused(tmp_path: Path
 def test_written_points_read_back_exactly(tmp_path: Path) -> None:
     """Any names (with commas and quotes), kinds and coordinates return bit for bit; nothing is left over."""
     random = np.random.default_rng(2)
-    names = ("A", "é,1", 'say "x"', "\u4e09", "'", "a;b")
+    names = ("A", "é,1", 'say "x"', "\u4e09", "'", "a;b", "#1", "# c, d")
     for kinds in (None, names):
         rows = random.normal(size=(len(names), 3)) * 10.0 ** random.integers(-300, 5, (len(names), 3))
         points = NamedPoints(names, guard_points(rows, names, where="test"), Space.LOCAL, kinds)

@@ -164,8 +164,9 @@ def test_a_host_without_a_robot_is_one_line(capfd):
 def test_a_recording_is_mirrored(drive, tmp_path, capsys):
     """As `export --format csv` writes it, comments and other columns and all; text a line a state, JSON one object."""
     path = tmp_path / "joints.csv"
-    rows = [f"insertion,{i * 0.1},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(drive.insertion_q[-3:])]
-    path.write_text("\n".join(["# a comment", f"phase,{COLUMNS}", *rows]))
+    rows = [f"{i * 0.1},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(drive.insertion_q[-2:])]
+    phases = [f"approach,{rows[1]}", *(f"insertion,{row}" for row in rows)]  # it begins again at 0 s
+    path.write_text("\n".join(["# a comment", f"phase,{COLUMNS}", *phases]))
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path)]) == 0
     captured = capsys.readouterr()
     assert "joints.csv: its last line has no line break at its end; was the file cut?" in captured.err

@@ -300,19 +300,18 @@ def _plain(text: str) -> str:
 
 def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     text = decode_text(data, str(path))
-    separator = max((",", ";", "\t"), key=text.partition("\n")[0].count)
+    separator = max((",", ";", "\t"), key=text.lstrip().partition("\n")[0].count)
     with refusing(csv.Error, "is not a CSV file", path, ALLOWED_CSV, "not_csv"):
-        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
-    header = rows[0] if rows else []
+        reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator)
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    header = rows[0][1] if rows else []  # here # is no comment: a colour may begin with it
     plain = [_plain(cell) for cell in header]  # ``label`` is a name next to an id, and a number next to a name
     name = next((plain.index(one) for one in NAME_COLUMNS if one in plain), None)
     number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)
     if name is None or number is None:
         shown = ",".join(header)[:100] or "missing"
         refuse(f"header {shown!r} has no column of labels and names", path, ALLOWED_CSV, "wrong_columns")
-    for line, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
+    for line, row in rows[1:]:
         where = f"{path}, line {line}"
         if len(row) != len(header):
             refuse(f"{len(row)} fields, not {len(header)}: {row}", where, ALLOWED_CSV, "ragged_row")
