@@ -1,6 +1,7 @@
 """``selfcal`` from the command line: simulate, calibrate, puncture, write; and read recordings back."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -88,7 +89,7 @@ def test_a_recording_gives_the_same_calibration(case_folder, done, tmp_path, cap
 
 
 def test_the_kept_pictures_give_the_same_calibration(case_folder, done, tmp_path, capsys):
-    """Read, detected and calibrated again, with the joints alone; every picture is an input, and none is written."""
+    """Read, detected and calibrated again; every picture is an input, and none is written."""
     kept, found = done.with_name("kept"), json.loads((done / "calibration.json").read_text())
     summary = answer(capsys, case_folder, "--recording", kept, "--out", tmp_path)
     for key in ("T_end1_image", "T_base1_base2", "tip_end2_mm", "predicted_tre_mm"):
@@ -105,7 +106,19 @@ def test_pictures_are_not_kept_of_a_recording_or_over_others(case_folder, done, 
     refused_command(["selfcal", case_folder, "--record", kept, *out], capsys, "output_exists")
     both = ["selfcal", "--recording", kept, "--record", tmp_path / "new", *out]
     refused_command(both, capsys, "conflicting_options")
-    refused_command(["selfcal", "--recording", kept, *out], capsys, "missing_column", "joints")  # arms of no case
+
+
+def test_the_kept_pictures_need_no_case(case_folder, done, tmp_path, capsys):
+    """They state the flanges, which are those that the case's arms turn the joints into; joints alone need the case."""
+    kept, out = done.with_name("kept"), ["--out", tmp_path / "out"]
+    shutil.copytree(kept, tmp_path / "joints")
+    lines = [line.split(",") for line in (kept / "recording.csv").read_text().split()]
+    (tmp_path / "joints" / "recording.csv").write_text("\n".join(",".join([one[0], *one[25:]]) for one in lines))
+    both = [answer(capsys, case_folder, "--recording", one, *out) for one in (kept, tmp_path / "joints")]
+    assert both[0]["T_base1_base2"] == pytest.approx(np.array(both[1]["T_base1_base2"]), abs=1e-9)
+    alone = answer(capsys, "--recording", kept, *out)
+    assert alone["tip_end2_mm"] == pytest.approx(both[0]["tip_end2_mm"], abs=1.0)
+    refused_command(["selfcal", "--recording", tmp_path / "joints", *out], capsys, "missing_column", "joints")
 
 
 def test_a_recording_without_joints_says_what_it_cannot_count(case_folder, done, tmp_path, capsys):

@@ -11,7 +11,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Ints, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count, uncounted
-from puncture_twin.planning.formats.csv_table import table_text
+from puncture_twin.planning.formats.csv_table import pose_values, table_text
 from puncture_twin.twin.devices import Arm, JogOperator, Probe
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection, Missed, detect
@@ -110,17 +110,22 @@ def acquire(
     return Acquisition(recording, tuple(shots), dict(reasons), tuple(missed), left)
 
 
-def keep_pictures(taken: Acquisition, pixel_mm: float, folder: Path) -> None:
-    """Write a recording with its pictures, found or not, into an empty folder: the tips are to be read from them."""
-    play = taken.recording.turn_probe is not None
-    header = ("name", *GROUPS["picture"], *GROUPS["pixel"], *GROUPS["q"], *(GROUPS["turn"] if play else ()))
+def keep_pictures(taken: Acquisition, case: SelfcalCase, folder: Path) -> None:
+    """Write a recording with its pictures, found or not, into an empty folder: the tips are to be read from them.
+
+    It has the flanges too, by each arm's nominal model as its controller states them, so that no case is needed.
+    """
+    groups = ("A", "B", "picture", "pixel", "q", *(("turn",) if taken.recording.turn_probe is not None else ()))
+    header = ("name", *(column for group in groups for column in GROUPS[group]))
     rows = []
     for shot in sorted((*taken.shots, *taken.missed_shots), key=lambda shot: shot.number):
         name = f"{shot.number + 1:03d}.png"
         (folder / name).write_bytes(png_bytes(shot.image))
-        turns = [*shot.turn_probe.tolist(), *shot.turn_needle.tolist()] if play else []
-        joints = np.degrees(np.concatenate([shot.q_probe, shot.q_needle])).tolist()
-        rows.append((str(shot.number + 1), name, pixel_mm, *joints, *turns))
+        q = np.array([shot.q_probe, shot.q_needle])
+        flanges = [pose_values(flange_pose(model, joints[None])) for model, joints in zip(case.models, q, strict=True)]
+        turns = [*shot.turn_probe.tolist(), *shot.turn_needle.tolist()] if "turn" in groups else []
+        pixel_mm = case.content.image.pixel_mm
+        rows.append((str(shot.number + 1), *np.ravel(flanges).tolist(), name, pixel_mm, *np.degrees(q.ravel()), *turns))
     (folder / FILE_NAME).write_text(table_text(header, rows), encoding="utf-8")
 
 

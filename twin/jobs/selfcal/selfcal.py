@@ -230,7 +230,7 @@ def run_selfcal(
                     files.append(detection_sheet(case, run.trials[0], draft.folder / sheet))
                     files.append(workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / room))
                 if record_folder is not None:
-                    keep_pictures(run.trials[0].acquisition, case.content.image.pixel_mm, record_folder)
+                    keep_pictures(run.trials[0].acquisition, case, record_folder)
             files.append(write_page(run, files[2:], draft.folder / ANSWERS[1]))
             draft.inputs, draft.seconds = run.inputs, run.stages.seconds
     except PlanningError:
