@@ -236,10 +236,8 @@ class CaseOptions:
 
 
 def _plain(value: object) -> Any:
-    """An array of NumPy as lists."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} is no value of a case file")
+    """An array of NumPy as lists. Raises TypeError: anything else that JSON does not know."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else json.JSONEncoder().default(value)
 
 
 NO_OPTIONS = CaseOptions()
