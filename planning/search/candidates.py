@@ -180,6 +180,24 @@ class Chances(Columns):
         blank = {name: np.full(shapes.get(name, (count,)), np.nan) for name in names}
         return cls(structures, refined=np.zeros(count, bool), **blank)
 
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns of the table of a case that declares errors, each (n,), after all others."""
+        kinds = {"touch": self.touch, "margin": self.margin}
+        wide = {
+            f"p_{kind}_{name}": values[:, at]
+            for kind, values in kinds.items()
+            for at, name in enumerate(self.structures)
+        }
+        return {
+            "p_hit": self.hit,
+            **wide,
+            "p_touch_any": self.touch_any,
+            "p_touch_joint": self.touch_joint,
+            "touch_refined": self.refined,
+            "sigma_lateral_mm": self.lateral_mm,
+            "sigma_depth_mm": self.depth_mm,
+        }
+
     def with_rows(self, rows: Ints, known: Chances) -> Chances:
         """These chances with those of some candidates replaced."""
         values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}

@@ -20,7 +20,7 @@ def to_table(candidates: Any) -> pa.Table:
     """One row per direction, columns as DESIGN names them: `theta_deg`, `beta_deg`, `verdict`, `reason`, ..."""
     columns = _path_columns(candidates) | _choice_columns(candidates)
     if candidates.chances is not None:
-        columns |= chance_columns(candidates.chances)
+        columns |= candidates.chances.columns()
     if candidates.deflection is not None:
         columns |= {"deflection_bound_mm": candidates.deflection}
     if candidates.breathing is not None:
@@ -67,24 +67,6 @@ def _choice_columns(candidates: Any) -> dict[str, Any]:
         "rank": candidates.ranking.rank,
         "pareto": candidates.ranking.pareto,
         "window": candidates.windows.of_row,
-    }
-
-
-def chance_columns(chances: Any) -> dict[str, NDArray[Any]]:
-    """The columns of a case that declares errors, after all others."""
-    wide = {
-        f"p_{kind}_{name}": getattr(chances, kind)[:, at]
-        for kind in ("touch", "margin")
-        for at, name in enumerate(chances.structures)
-    }
-    return {
-        "p_hit": chances.hit,
-        **wide,
-        "p_touch_any": chances.touch_any,
-        "p_touch_joint": chances.touch_joint,
-        "touch_refined": chances.refined,
-        "sigma_lateral_mm": chances.lateral_mm,
-        "sigma_depth_mm": chances.depth_mm,
     }
 
 
