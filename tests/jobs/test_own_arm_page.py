@@ -17,7 +17,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.run_twin import main
 
 PAGE = (ROOT / "docs" / "how-to" / "own-arm.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^python run_twin\.py (.+)$", PAGE, re.MULTILINE)
+COMMANDS = re.findall(r"^run-twin (.+)$", PAGE, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from places import ROOT
 from puncture_twin.run_twin import main
 
 PAGE = ROOT / "docs" / "how-to" / "chen-2019.md"
-COMMANDS = re.findall(r"^python run_twin\.py (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+COMMANDS = re.findall(r"^run-twin (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
 
 SAID = {
     "reproduce chen2019": "all within their limits",
