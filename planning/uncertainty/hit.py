@@ -9,8 +9,8 @@ surface is crossed at distances rho_ij, and with m_i^2 = u_i' Sigma^-1 u_i
 where s_ij is +1 for the last crossing and alternates inwards, which is right for a target outside or on the surface
 too. A surface that lies off as a whole by z standard deviations s moves a crossing by z s / (n . u), n its face's
 normal; F3 is odd, so that this is right where it moves past the target, and P is the mean over z. Where the residuals
-gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a radius the chance is
-averaged over chi-squared.
+gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a radius every term of the
+series a beta distribution.
 
 **To touch** (`proximity`): the axis point f + s u is nearest to structure j at distance D, n the unit vector from it.
 
@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.special import chdtri, erf, fdtr, ndtr, ndtri, stdtr
+from scipy.special import erf, fdtr, ndtr, ndtri, stdtr
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
@@ -73,11 +73,7 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
     where the residuals gave it.
     """
     values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
-    if freedom is None:
-        return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
-    parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)  # a larger error is a smaller radius
-    return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
+    return chance_within(values, np.full((len(cov), 1), radius_mm), freedom)[:, 0]
 
 
 def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) -> float:
@@ -97,20 +93,29 @@ def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) ->
     return float(brentq(missing, 0.0, high, xtol=1e-4 * size))
 
 
-QUANTILES = 64
-"""Quantiles of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
-
-
-def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
-    """The chance that a normal error stays within radii (n, m), mm, by Ruben's series (Ann. Math. Stat. 33, 1962).
+def chance_within(eigenvalues: Floats, radii: Floats, freedom: int | None = None) -> Floats:
+    """The chance that an error stays within radii (n, m), mm, by Ruben's series (Ann. Math. Stat. 33, 1962).
 
     Of eigenvalues (n, 3), mm², above 0. With beta the least and gamma_i = 1 - beta / lambda_i, P = sum_k c_k F_{3+2k}(x
     / beta), F the chi-squared distribution; one gamma is 0, and (k+1) c_{k+1} = e1 (k + 1/2) c_k - e2 k c_{k-1} with e1
-    and e2 the sum and product of the other two.
+    and e2 the sum and product of the other two. The mean over nu / chi-squared, the square of an error's uncertain
+    size, goes term by term: F_{3+2k}(x) becomes the beta distribution I_y(3/2 + k, nu / 2), y = x / (x + nu).
     """
     chances = np.empty(radii.shape)
-    _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, chances)
+    _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, freedom or 0, chances)
     return chances
+
+
+@nb.njit(cache=True, error_model="numpy")
+def student_within(t, freedom):  # type: ignore[no-untyped-def]
+    """The chance that Student's t of whole degrees lies within ±t (Abramowitz, Stegun, 26.7.3 and 26.7.4)."""
+    square = 1.0 / (1.0 + t * t / freedom)  # of the cosine of atan(t / sqrt(nu))
+    odd = freedom % 2
+    total, term = 0.0, t / math.sqrt(freedom) * (square if odd else math.sqrt(square))
+    for k in range(2 + odd, freedom + 1, 2):
+        total += term
+        term *= square * (k - 1.0) / k
+    return (math.atan(t / math.sqrt(freedom)) + total) * 2.0 / math.pi if odd else total
 
 
 SERIES_END = 1e-8
@@ -120,31 +125,41 @@ MOST_TERMS = 20_000
 
 
 @nb.njit(cache=True)
-def _ruben(values, squares, chances):  # type: ignore[no-untyped-def]  # numba infers
+def _ruben(values, squares, freedom, chances):  # type: ignore[no-untyped-def]  # numba infers
     for row in range(len(values)):
         beta, mid, high = values[row]
         g1, g2 = 1.0 - beta / mid, 1.0 - beta / high
         start = math.sqrt(beta / mid * beta / high)
         for column in range(squares.shape[1]):
-            chances[row, column] = _series(start, g1 + g2, g1 * g2, squares[row, column] / beta)
+            chances[row, column] = _series(start, g1 + g2, g1 * g2, squares[row, column] / beta, freedom)
 
 
 @nb.njit(cache=True)
-def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
-    """Sum c_k F_{3+2k}(x), with F_{nu+2}(x) = F_nu(x) - (x/2)^(nu/2) exp(-x/2) / Gamma(nu/2 + 1)."""
+def _series(weight, e1, e2, x, freedom):  # type: ignore[no-untyped-def]
+    """Sum c_k F_{3+2k}(x), with F_{nu+2}(x) = F_nu(x) - (x/2)^(nu/2) exp(-x/2) / Gamma(nu/2 + 1).
+
+    Or I_y(a + 1, b) = I_y(a, b) - y^a (1 - y)^b / (a B(a, b)) with b half of ``freedom``, which is 0 of known sizes.
+    """
     half = 0.5 * x
     if half <= 0.0:
         return 0.0
-    before, left, total = 0.0, 1.0, 0.0
-    F = math.erf(math.sqrt(half)) - math.sqrt(4.0 * half / math.pi) * math.exp(-half)
-    log_step = 1.5 * math.log(half) - half - math.lgamma(2.5)
+    before, left, total, b = 0.0, 1.0, 0.0, 0.5 * freedom
+    if freedom == 0:
+        F = math.erf(math.sqrt(half)) - math.sqrt(4.0 * half / math.pi) * math.exp(-half)
+        log_step, log_ratio = 1.5 * math.log(half) - half - math.lgamma(2.5), math.log(half)
+    else:
+        log_ratio, log_last = -math.log1p(b / half), math.lgamma(0.5 + b) - math.lgamma(b) - b * math.log1p(half / b)
+        F = student_within(math.sqrt(x), freedom) - math.exp(0.5 * log_ratio + log_last - math.lgamma(1.5))
+        log_step = 1.5 * log_ratio + log_last + math.log(0.5 + b) - math.lgamma(2.5)
     for k in range(MOST_TERMS):
         total += weight * F
         left -= weight
         if left < SERIES_END or F <= 0.0:
             break
         F = max(F - math.exp(log_step), 0.0)
-        log_step += math.log(half) - math.log(k + 2.5)
+        log_step += log_ratio - math.log(k + 2.5)
+        if freedom > 0:
+            log_step += math.log(k + 1.5 + b)
         weight, before = (e1 * (k + 0.5) * weight - e2 * k * before) / (k + 1.0), weight
     return min(max(total, 0.0), 1.0)
 

@@ -10,7 +10,16 @@ Pradlwarter, Schueller, Prob. Eng. Mech. 19, 2004). The mean over y is a rule of
 (Stroud, Approximate Calculation of Multiple Integrals, 1971, E_n^r2 5-2 with n = 4). Where its lines disagree, or
 several things are about as likely, 128 lines spread by Sobol; where these disagree, 512. Where another direction
 touches sooner than first order's (found by 51 rays), a is that one. A surface that may lie off as a whole is one more
-normal; errors whose size is uncertain give every line a size of its own.
+normal.
+
+Errors whose size is uncertain, sqrt(nu / chi-squared), make z a Student's t of nu degrees in d dimensions, and no size
+has to be drawn: y is one in d - 1, and beta, where y is given, Student's t of nu + d - 1 degrees and scale
+
+    c = sqrt((nu + y'y) / (nu + d - 1)),      P = E_y[sum T(beta_out / c) - T(beta_in / c)]
+
+(Ding, Am. Stat. 70, 2016). The length of y is stratified more densely the rarer it is, and lines are weighted for it.
+Were the structure flat, a line would say T(-slack / (sigma c)), of which the mean is known: the lines say by how much
+it differs.
 
 A step along a line is never longer than the needle's distance over the fastest that any of its points moves, so that
 entry *and* exit of every stretch are found. Through what it touches the walk goes in small steps, and at every exit it
@@ -28,7 +37,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from scipy.special import chdtri, ndtr, ndtri, stdtr
+from scipy.special import fdtri, ndtr, ndtri, stdtr, stdtrit
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
@@ -40,7 +49,7 @@ from puncture_twin.planning.clearance.kernels.blocks import Blocks
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.segment_triangle import beyond, displaced_distance
 from puncture_twin.planning.geometry.rigid import frame_about, skew
-from puncture_twin.planning.uncertainty.hit import Proximity
+from puncture_twin.planning.uncertainty.hit import Proximity, student_within
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +77,7 @@ def refined(
 
     Of the faces of k structures in blocks, axes of a length (n, k) from the target (3,), and thresholds (k,): radius,
     or that and a margin; mm. A structure of which no face is within the needle's reach keeps its first order: it is
-    touched less than once in 100,000 times.
+    touched less than once in 100,000 times, or in 10,000 where the errors' size is uncertain.
     """
     chances = first.copy()
     rows = np.flatnonzero((wanted & np.isfinite(first)).any(axis=1))
@@ -99,49 +108,67 @@ def line_chance(
 ) -> float:
     """P that the needle comes nearer to a structure than a threshold, mm; NaN where nothing displaces it.
 
-    By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines. Where
-    the errors' size is uncertain every line has its own, and the lines say by how much first order errs. The faces are
-    those within `NeedleUncertainty.reach`, and g (6,) is what shift and rotation do to the distance, to first order.
+    By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines. The
+    faces are those within `NeedleUncertainty.reach`, and g (6,) is what shift and rotation do to the distance, to first
+    order.
     """
     origin, outward, freedom = uncertainty.origin, uncertainty.outward, uncertainty.freedom
     problem = (near.triangles, near.faces, near.blocks, origin, outward, float(length), float(threshold))
     ends = tuple(origin.tolist()), tuple(outward.tolist())
     nominal = displaced_distance(near.triangles, near.faces, near.blocks, *ends, float(length), -1.0, 0)[0]
     slack, slope = min(float(nominal), 1e9) - threshold, uncertainty.root.T @ gradient
-    sigma = math.hypot(float(np.linalg.norm(slope)), uncertainty.surface_mm)
     likeliest, alone = likeliest_slope(problem, uncertainty, slope, slack)
     steep = math.hypot(float(np.linalg.norm(likeliest)), uncertainty.surface_mm)
     if not steep > 0.0:  # nothing moves the needle against the structure
         return math.nan
     basis = line_basis(likeliest, uncertainty.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
-    first, surface = -slack / max(sigma, 1e-12), uncertainty.surface_mm > 0.0
-    rules = [many_lines(surface, count, freedom) for count in (MANY_LINES, MOST_LINES)]
+    surface, flat, whole = uncertainty.surface_mm > 0.0, -slack / steep, 0.0
+    rules = [many_lines(surface, count, freedom) for count in (MANY_LINES if freedom is None else STUDENT_LINES)]
     if alone and freedom is None:
         rules.insert(0, few_lines(surface))  # exact enough only about one smooth nearest surface
+    done = np.empty(0)
     for lines in rules:
-        chances = walked(problem, uncertainty.root, uncertainty.surface_mm, basis, lines.offsets, lines.sizes)
-        whole = 0.0
+        more = lines.without_first(len(done))
+        chances = np.append(done, walked(problem, uncertainty.root, uncertainty.surface_mm, basis, more))
+        done = done if lines is few_lines(surface) else chances  # every spread of lines continues the one before
         if freedom is not None:
-            whole, chances = float(stdtr(freedom, first)), chances - ndtr(first / lines.sizes)
+            whole, chances = float(stdtr(freedom, flat)), chances - stdtr(lines.degrees, flat / lines.scales)
         mean = float(lines.weights @ chances)
-        if math.sqrt(float(lines.weights @ (chances - mean) ** 2)) <= DISAGREE:
+        deviation = math.sqrt(float(lines.weights @ (chances - mean) ** 2))
+        if deviation <= (DISAGREE if freedom is None else agreement(len(chances), whole + mean)):
             break
     return min(max(whole + mean, 0.0), 1.0)
 
 
-MANY_LINES, MOST_LINES = 128, 512
+def agreement(count: int, chance: float) -> float:
+    """Deviation up to which lines over Student's t are trusted: spread evenly, they err by a quarter of its error."""
+    return 4.0 * math.sqrt(count) * max(ERRS_BY, ERRS_BY_PART * chance)
+
+
+MANY_LINES, STUDENT_LINES = (128, 512), (128, 256, 512)
 """Where something else is touched about as soon as what is likeliest, or sizes are uncertain; where these disagree."""
+ERRS_BY, ERRS_BY_PART = 3e-4, 0.02
+"""Error of a chance, and of what is that part of it, that is not worth more lines."""
 DISAGREE = 0.1
 """Standard deviation of the lines' chances up to which few are trusted with .003: against 4,096 lines they err by that
 at most, and by .013 where it is .2 (three anatomies; next to a lung and between ribs)."""
 
 
 class Lines(NamedTuple):
-    """Offsets and sizes of n lines."""
+    """Offsets of n lines, and the distribution of the error along each."""
 
     offsets: Floats  # shape (n, 5), standard deviations, four of the pose and one mixed with the surface
-    sizes: Floats  # shape (n,), of each line's errors over the estimate
+    scales: Floats  # shape (n,), of the error along it, standard deviations
+    farthest: Floats  # shape (n,), scales that it is walked to either side; an open stretch there goes on for ever
+    degrees: int  # of Student's t along it; 0 of the normal
     weights: Floats  # shape (n,), their sum is 1
+
+    def without_first(self, count: int) -> Lines:
+        """All but the first of them."""
+        offsets, scales, farthest, weights = (
+            part[count:] for part in (self.offsets, self.scales, self.farthest, self.weights)
+        )
+        return Lines(offsets, scales, farthest, self.degrees, weights)
 
 
 @cache
@@ -156,26 +183,47 @@ def few_lines(surface: bool) -> Lines:
     if surface:
         mixed = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
         offsets, weights = np.concatenate([offsets + mixed, offsets - mixed]), np.tile(weights, 2) / 2
-    return Lines(offsets, np.ones(len(offsets)), weights)
+    return _normal_lines(offsets, weights)
 
 
 @cache
 def many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
-    """Lines spread evenly over a normal, with sizes that are equally likely."""
-    mixed = 1 if surface else 0
-    dimensions = 4 + mixed + (freedom is not None)
+    """Lines spread evenly over a normal, or over Student's t."""
+    across = 5 if surface else 4
+    dimensions = across + (freedom is not None)
 
     def make() -> Arrays:
         return {"points": scipy.stats.qmc.Sobol(dimensions, scramble=True, seed=SCRAMBLED_WITH).random(count)}
 
     made_from = {"what": "sobol", "dimensions": dimensions, "count": count, "seed": SCRAMBLED_WITH}
     drawn = user_cache().arrays(made_from, make, by=__name__)["points"]  # shape (count, dimensions), in 0..1
-    normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
+    normal = ndtri(np.clip(drawn[:, :across], 1e-12, 1 - 1e-12))
     length = np.linalg.norm(normal, axis=1)[:, None]
     offsets = np.zeros((count, 5))
-    offsets[:, : 4 + mixed] = normal * np.minimum(1.0, WIDEST / length)  # farther ones are pulled in
-    sizes = np.ones(count) if freedom is None else error_sizes(freedom)[(drawn[:, -1] * SIZES).astype(np.int64)]
-    return Lines(offsets, sizes, np.full(count, 1.0 / count))
+    if freedom is None:
+        offsets[:, :across] = normal * np.minimum(1.0, WIDEST / length)  # farther ones are pulled in
+        return _normal_lines(offsets, np.full(count, 1.0 / count))
+    edge = widest_error(freedom)
+    radii = np.minimum(student_radius(across, freedom, drawn[:, -1] ** RARER), 0.9 * edge)
+    offsets[:, :across] = normal * (radii[:, None] / length)
+    weights, degrees = drawn[:, -1] ** (RARER - 1), freedom + across
+    scales = np.sqrt((freedom + radii**2) / degrees)
+    farthest = np.minimum(np.sqrt(edge**2 - radii**2) / scales, -stdtrit(degrees, BEYOND))
+    return Lines(offsets, scales, farthest, degrees, weights / weights.sum())
+
+
+def _normal_lines(offsets: Floats, weights: Floats) -> Lines:
+    return Lines(offsets, np.ones(len(offsets)), np.full(len(offsets), FARTHEST), 0, weights)
+
+
+def student_radius(dimensions: int, freedom: int, chance: Floats | float) -> Floats:
+    """Length that Student's t in some dimensions exceeds with a chance, standard deviations."""
+    return np.asarray(np.sqrt(dimensions / fdtri(freedom, dimensions, chance)))
+
+
+def widest_error(freedom: int) -> float:
+    """Radius of the ball within which lines are walked where the errors' size is uncertain, standard deviations."""
+    return min(float(student_radius(6, freedom, BEYOND)), WIDEST_UNCERTAIN)
 
 
 SCRAMBLED_WITH = 20191104
@@ -200,8 +248,10 @@ FARTHEST = 5.0
 """Standard deviations that a line is walked to either side; a stretch that is open there goes on for ever."""
 WIDEST = 4.0
 """Standard deviations across which a line may lie: what lies beyond has a chance of .003 and less to matter."""
-SIZES = 16
-"""Quantiles of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
+RARER = 2
+"""The line at a fraction v of all has an offset that is exceeded with a chance of v to this power."""
+BEYOND, WIDEST_UNCERTAIN = 1e-4, 60.0
+"""Chance of errors of an uncertain size that are larger than any that is walked; and the most standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,9 +273,12 @@ class NeedleUncertainty:
     @cached_property
     def _size(self) -> float:
         """Bound of the displacement on any line, in standard deviations."""
-        return math.hypot(FARTHEST, WIDEST + 1.0) * (
-            1.0 if self.freedom is None else float(error_sizes(self.freedom).max())
-        )
+        return math.hypot(FARTHEST, WIDEST + 1.0) if self.freedom is None else widest_error(self.freedom)
+
+    @property
+    def rays_to(self) -> float:
+        """Standard deviations that a ray is followed."""
+        return RAYS_TO if self.freedom is None else min(-float(stdtrit(self.freedom, ndtr(-RAYS_TO))), self._size)
 
     @cached_property
     def _widths(self) -> Callable[[float], tuple[float, float, float]]:
@@ -255,12 +308,6 @@ def needle_uncertainty(
     return NeedleUncertainty(origin, outward, np.ascontiguousarray(root), surface_mm, freedom)
 
 
-@cache
-def error_sizes(freedom: int) -> Floats:
-    """Factors of the errors' true size over the estimate: sqrt(nu / chi-squared) at equal chances."""
-    return np.asarray(np.sqrt(freedom / chdtri(freedom, (np.arange(SIZES) + 0.5) / SIZES)))
-
-
 @nb.njit(cache=True, error_model="numpy")
 def displacement(root, z):  # type: ignore[no-untyped-def]
     """Shift, lean and the surface's normal, shape (7,)."""
@@ -288,8 +335,8 @@ def outran(clear_to, beta, clear, smallest):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def fastest_approach(scene, start, ahead):  # type: ignore[no-untyped-def]
-    """The most by which the distance can fall per standard deviation: an end of the axis is its fastest point."""
+def fastest_approach(scene, start, ahead, farthest):  # type: ignore[no-untyped-def]
+    """The most by which the distance can fall per scale, as far as the farthest: an end of the axis moves fastest."""
     outward, length, surface_mm = scene[4], scene[5], scene[7]
     ux, uy, uz = outward[0], outward[1], outward[2]
     dx, dy, dz, px, py, pz = ahead[0], ahead[1], ahead[2], ahead[3], ahead[4], ahead[5]
@@ -297,9 +344,17 @@ def fastest_approach(scene, start, ahead):  # type: ignore[no-untyped-def]
     x, y = dx + length * (py * uz - pz * uy), dy + length * (pz * ux - px * uz)
     z = dz + length * (px * uy - py * ux)
     turn = math.sqrt(px * px + py * py + pz * pz)
-    lean = math.sqrt(start[3] ** 2 + start[4] ** 2 + start[5] ** 2) + FARTHEST * turn
+    lean = math.sqrt(start[3] ** 2 + start[4] ** 2 + start[5] ** 2) + farthest * turn
     fastest = math.sqrt(max(at_tip, x * x + y * y + z * z)) + length * lean * turn
     return fastest + surface_mm * abs(ahead[6]) + 1e-12
+
+
+@nb.njit(cache=True, error_model="numpy")
+def fastest_far_out(scene, ahead):  # type: ignore[no-untyped-def]
+    """Another bound, however far the needle has leant: the tip's speed and the length times that of the rotation."""
+    tip = math.sqrt(ahead[0] ** 2 + ahead[1] ** 2 + ahead[2] ** 2)
+    turn = math.sqrt(ahead[3] ** 2 + ahead[4] ** 2 + ahead[5] ** 2)
+    return tip + scene[5] * turn + scene[7] * abs(ahead[6]) + 1e-12
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -337,27 +392,29 @@ ROOT_HALF = math.sqrt(0.5)
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def walked(problem, root, surface_mm, basis, offsets, sizes):  # type: ignore[no-untyped-def]  # numba infers
-    """The chance along each line, shape (n,); its errors are so many times as large (n,)."""
-    chances, hint = np.empty(len(offsets)), np.int64(0)
+def walked(problem, root, surface_mm, basis, lines):  # type: ignore[no-untyped-def]  # numba infers
+    """The chance along each line, shape (n,)."""
+    chances, hint = np.empty(len(lines.offsets)), np.int64(0)
     triangles, faces, blocks, origin, outward, length, threshold = problem
     scene = (triangles, faces, blocks, origin, outward, length, threshold, surface_mm)
     down = displacement(root, basis[0])
-    for line in range(len(offsets)):
+    for line in range(len(chances)):
         z = np.zeros(6)
         for k in range(5):
             for x in range(6):
-                z[x] += offsets[line, k] * basis[k + 1, x]
-        start, ahead = sizes[line] * displacement(root, z), sizes[line] * down
-        chances[line], hint = _walk(scene, start, ahead, hint)
+                z[x] += lines.offsets[line, k] * basis[k + 1, x]
+        start, ahead, farthest = displacement(root, z), lines.scales[line] * down, lines.farthest[line]
+        chances[line], hint = _walk(scene, start, ahead, farthest, lines.degrees, hint)
     return chances
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
-    """Sum of Phi over the stretches of one line that touch."""
-    fastest = fastest_approach(scene, start, ahead)
-    low, high, closing, inside, entry, total = -np.inf, -FARTHEST, False, False, -np.inf, 0.0
+def _walk(scene, start, ahead, farthest, degrees, hint):  # type: ignore[no-untyped-def]
+    """Sum of Phi, or of Student's T, over the stretches of one line that touch."""
+    fastest = fastest_approach(scene, start, ahead, farthest)
+    if degrees > 0:
+        fastest = min(fastest, fastest_far_out(scene, ahead))
+    low, high, closing, inside, entry, total = -np.inf, -farthest, False, False, -np.inf, 0.0
     clear = 0.0  # beyond low, of what the last distance leaves free
     while True:  # one place that wants the distance: it is compiled into each
         beta = 0.5 * (low + high) if closing else high
@@ -375,13 +432,14 @@ def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
             if closing:
                 continue
             if inside:
-                total += _normal(high) - _normal(entry)
+                total += _below(high, degrees) - _below(entry, degrees)
             entry, inside, beta, gap = low, not inside, high, SMALLEST_STEP * fastest
-        left, so_far = _normal(-beta), total + (_normal(beta) - _normal(entry) if inside else 0.0)
-        if beta >= FARTHEST or left <= LITTLE * so_far:
+        left = _below(-beta, degrees)
+        so_far = total + (_below(beta, degrees) - _below(entry, degrees) if inside else 0.0)
+        if beta >= farthest or left <= LITTLE * so_far:
             return so_far + (left if so_far > 0.0 else 0.0), hint
         step = INSIDE_STEP if inside else next_step(gap / fastest, clear, beta - low, SMALLEST_STEP)
-        low, high, clear = beta, min(beta + step, FARTHEST), gap / fastest
+        low, high, clear = beta, min(beta + step, farthest), gap / fastest
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -418,16 +476,20 @@ def _swallowed(scene, start, ahead, beta):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _normal(x):  # type: ignore[no-untyped-def]
-    return 0.5 * math.erfc(-x * ROOT_HALF)
+def _below(x, degrees):  # type: ignore[no-untyped-def]
+    """The normal's distribution, or that of Student's t."""
+    if degrees == 0:
+        return 0.5 * math.erfc(-x * ROOT_HALF)
+    return 0.5 + 0.5 * student_within(x, degrees) if math.isfinite(x) else 0.0
 
 
 RAYS_TO, RAY_STEP = 4.0, 0.1
-"""Standard deviations that a ray is followed, and its smallest step: it only tells what is touched about as soon."""
+"""Standard deviations that a ray is followed, or what is as rare of Student's t, and its smallest step: it only tells
+what is touched about as soon."""
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
-def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-def]
+def first_touches(problem, root, directions, rays_to, radii):  # type: ignore[no-untyped-def]
     """Fill, for rays along ``directions`` (n, 5) from the nominal needle, how far out each touches; or infinity."""
     triangles, faces, blocks, origin, outward, length, threshold = problem
     scene = (triangles, faces, blocks, origin, outward, length, threshold, 0.0)
@@ -436,16 +498,16 @@ def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-
     for ray in range(len(directions)):
         for k in range(5):
             z[k] = directions[ray, k]
-        radii[ray] = _first_touch(scene, start, displacement(root, z), nominal, nearest)
+        radii[ray] = _first_touch(scene, start, displacement(root, z), rays_to, nominal, nearest)
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _first_touch(scene, start, ahead, gap, hint):  # type: ignore[no-untyped-def]
+def _first_touch(scene, start, ahead, rays_to, gap, hint):  # type: ignore[no-untyped-def]
     """Standard deviations at which a ray first touches, from where the clearance is ``gap``."""
-    fastest, beta, low, clear = fastest_approach(scene, start, ahead), 0.0, 0.0, 0.0
-    while gap >= 0.0 and beta < RAYS_TO:
+    fastest, beta, low, clear = fastest_approach(scene, start, ahead, 1.25 * rays_to), 0.0, 0.0, 0.0
+    while gap >= 0.0 and beta < rays_to:
         step = next_step(gap / fastest, clear, beta - low, RAY_STEP)
-        low, clear, beta = beta, gap / fastest, min(beta + step, RAYS_TO)
+        low, clear, beta = beta, gap / fastest, min(beta + step, rays_to)
         gap, hint = gap_beyond(scene, start, ahead, beta, hint)
         if outran(low + clear, beta, gap / fastest, RAY_STEP):
             beta = low + max(clear, RAY_STEP)
@@ -453,9 +515,9 @@ def _first_touch(scene, start, ahead, gap, hint):  # type: ignore[no-untyped-def
     return beta if gap < 0.0 else np.inf
 
 
-BETTER_BY, TOUCHED_SOONER, TOO_FAR = 0.1, 0.8, 3.8
+BETTER_BY, TOUCHED_SOONER, TOO_FAR = 0.1, 0.8, 0.95
 """Standard deviations by which another direction must be better than first order's; how much sooner than a plane
-something else is touched; and how far out it does not matter."""
+something else is touched; and at which part of a ray it does not matter."""
 
 
 def likeliest_slope(
@@ -469,14 +531,14 @@ def likeliest_slope(
     size = float(np.linalg.norm(slope))
     directions = np.vstack([-slope / size if size > 0.0 else np.eye(5)[0], _rays()])
     radii = np.empty(len(directions))
-    first_touches(problem, uncertainty.root, directions, radii)
+    first_touches(problem, uncertainty.root, directions, uncertainty.rays_to, radii)
     best = int(np.argmin(radii))
     if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + BETTER_BY:
         best = 0
     flat = np.full(len(radii), np.inf)
     towards = directions @ directions[best]  # cosine: a plane across the best is hit at radius / cosine
     np.divide(radii[best], towards, out=flat, where=towards > 0.05)
-    alone = not bool(((radii < TOUCHED_SOONER * flat) & (radii < TOO_FAR)).any())
+    alone = not bool(((radii < TOUCHED_SOONER * flat) & (radii < TOO_FAR * uncertainty.rays_to)).any())
     return (slope, alone) if best == 0 else (-directions[best] * (slack / radii[best]), alone)
 
 

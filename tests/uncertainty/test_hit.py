@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
-from scipy.special import chdtr, ndtr
+from scipy.special import chdtr, fdtr, ndtr, stdtr
+from scipy.stats import chi2
 
 from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.clearance.fast_engine import FastEngine
@@ -18,6 +19,7 @@ from puncture_twin.planning.uncertainty.hit import (
     mean_over_faces,
     proximity,
     rays_to_ball,
+    student_within,
     target_rays,
     touch_chance,
 )
@@ -114,6 +116,29 @@ def test_an_error_whose_size_was_estimated_follows_fishers_f(ball):
     assert hit_in_ball(cov[None], 2.0, 3)[0] == pytest.approx(drawn.mean(), abs=0.002)
     rays = target_rays(ball(2.0, subdivisions=4), np.zeros(3))
     assert hit_in_mesh(rays, cov[None], 3)[0] == pytest.approx(drawn.mean(), abs=0.006)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 5, 9, 30])
+def test_within_a_radius_by_an_error_of_unknown_size(freedom):
+    """Equal axes are Fisher's F; of others the mean of the series over chi-squared, by quadrature."""
+    for radius in (0.3, 1.0, 3.0, 10.0, 80.0):
+        assert hit_in_ball(4 * np.eye(3)[None], radius, freedom)[0] == pytest.approx(
+            fdtr(3, freedom, radius**2 / 12), abs=1e-9
+        )
+        values, size = np.array([[0.3, 1.0, 9.0]]), np.linspace(-12.0, 6.0, 4001)  # logarithm of chi-squared
+        density = np.exp(size) * chi2.pdf(np.exp(size), freedom)
+        within = chance_within(values, radius * np.sqrt(np.exp(size) / freedom)[None])[0]
+        averaged = np.trapezoid(within * density, size)
+        missing = chdtr(freedom, np.exp(-12.0))  # of sizes larger than any there
+        found = hit_in_ball(np.diag(values[0])[None], radius, freedom)[0]
+        assert averaged - 1e-6 <= found <= averaged + missing + 1e-6
+
+
+def test_students_t_of_whole_degrees():
+    t = np.linspace(-40.0, 40.0, 321)
+    for freedom in (1, 2, 3, 4, 7, 8, 35, 300):
+        found = [student_within(x, freedom) for x in t]
+        np.testing.assert_allclose(found, 2 * stdtr(freedom, t) - 1, atol=1e-13)
 
 
 def test_no_error_hits_for_certain_and_outside_never(ball):

@@ -5,7 +5,6 @@ import pytest
 import trimesh
 from oracles import measure_displaced
 from scipy.special import ndtr, stdtr
-from scipy.stats import chi2
 
 from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.clearance.fast_engine import FastEngine, near_faces
@@ -68,9 +67,9 @@ def test_both_sides_of_a_gap_count(distance):
     assert found == pytest.approx(2 * one, abs=0.003)
 
 
-def tube_of(inner):
+def tube_of(inner, thick=5.0):
     """A tube around the needle; of 128 sides: its flats are nearer by .001 mm at most, its chance by .0003 of .01."""
-    return moved(trimesh.creation.annulus(r_min=inner, r_max=inner + 5.0, height=4000.0, sections=128))
+    return moved(trimesh.creation.annulus(r_min=inner, r_max=inner + thick, height=4000.0, sections=128))
 
 
 @pytest.mark.parametrize("inner", [1.6, 4.6])
@@ -123,12 +122,33 @@ def test_the_nearest_face_is_not_always_the_likeliest():
     assert found == pytest.approx(exact, abs=0.003)
 
 
-@pytest.mark.parametrize("freedom", [3, 6])
-def test_an_unknown_size_is_averaged(freedom):
-    """The tube's chance over the errors' possible sizes, exp(-d^2 / 2 s^2)."""
-    found = chances(tube_of(4.6), SHIFT, freedom=freedom)[1]
-    sizes = freedom / chi2.ppf((np.arange(20000) + 0.5) / 20000, freedom)
-    assert found == pytest.approx(np.mean(np.exp(-(4.0**2) / 2 / sizes)), abs=0.01)
+@pytest.mark.parametrize("freedom", [3, 5, 9, 30])
+def test_an_unknown_size_is_integrated_out_in_body_and_tail(freedom):
+    """P of Student's t in two dimensions to leave a circle, (1 + d^2 / nu)^(-nu / 2), in a tube that nothing leaves."""
+    for distance in (2.0, 4.0, 6.0, 8.0):
+        found = chances(tube_of(distance + RADIUS, thick=1000.0), SHIFT, freedom=freedom)[1]
+        exact = (1 + distance**2 / freedom) ** (-freedom / 2)
+        assert found == pytest.approx(exact, abs=max(0.08 * exact, 3e-4))
+
+
+@pytest.mark.parametrize("surface", [False, True])
+@pytest.mark.parametrize("freedom", [3, 5, 9, 30])
+def test_the_lines_of_an_unknown_size_have_students_t_together(surface, freedom):
+    """The law of the scale along a line: averaged over the lines a plane is passed as often as Student's t says."""
+    for count in module.STUDENT_LINES:
+        lines = module.many_lines(surface, count, freedom)
+        for distance in (0.5, 1.0, 2.0, 4.0, 8.0):
+            passed = lines.weights @ stdtr(lines.degrees, -distance / lines.scales)
+            assert passed == pytest.approx(stdtr(freedom, -distance), rel=0.01, abs=2e-4)
+        assert lines.weights.sum() == pytest.approx(1.0)
+
+
+def test_more_lines_continue_the_fewer():
+    for freedom, counts in ((None, module.MANY_LINES), (3, module.STUDENT_LINES)):
+        fewer, *more = (module.many_lines(True, count, freedom) for count in counts)
+        for lines in more:
+            np.testing.assert_array_equal(lines.offsets[: len(fewer.offsets)], fewer.offsets)
+            np.testing.assert_array_equal(lines.farthest[: len(fewer.offsets)], fewer.farthest)
 
 
 @pytest.mark.parametrize("kind", [FastEngine, FclEngine])
@@ -160,7 +180,7 @@ def test_threads_change_no_bit(monkeypatch):
     for threads in (1, 8):
         monkeypatch.setattr(module, "MOST_THREADS", threads)
         monkeypatch.setattr("puncture_twin.planning.base.processes.worker_count", lambda wanted, _: wanted)
-        for draws in (module.many_lines, module.few_lines, module.error_sizes):
+        for draws in (module.many_lines, module.few_lines):
             draws.cache_clear()  # so that threads make them side by side
         needles = Needles(outward, np.tile(LEAN, (count, 1, 1)), near, np.zeros(shape), 6)
         first, around = touch_chance(near, RADIUS, 6), (engine.blocks, np.full(shape, LENGTH), np.zeros(3))
