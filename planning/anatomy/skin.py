@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
+from puncture_twin.planning.anatomy.skin_normals import broad_normals
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, box_in, frame, framed_surface, mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.geometry.containment import consistent_crossings
-from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, split_at_creases
+from puncture_twin.planning.geometry.mesh import TriangleMesh, blended_normals, smooth_normals, split_at_creases
 from puncture_twin.planning.geometry.rigid import pose
 
 HU_RANGE, HU_LEAST = 500.0, 50.0
@@ -39,14 +40,18 @@ class Skin:
     field_of_view: FieldOfView | None
     """The imaged box; None for a mesh, which states none."""
     warnings: tuple[str, ...]
+    normals: Floats | None = None
+    """Shape (n, 3), unit normal at each vertex, without the voxels' stairs; None for a mesh, whose own are its."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cut_faces", read_only(self.cut_faces, np.bool_))
+        if self.normals is not None:
+            object.__setattr__(self, "normals", read_only(self.normals, np.float64))
 
     @property
     def nbytes(self) -> int:
         """Bytes of mesh and flags."""
-        return self.mesh.nbytes + self.cut_faces.nbytes
+        return self.mesh.nbytes + self.cut_faces.nbytes + (0 if self.normals is None else self.normals.nbytes)
 
 
 def skin_of_image(image: CtImage) -> Skin:
@@ -140,7 +145,7 @@ def _skin(mesh: TriangleMesh, body: BodyMask, T_ct_index: Floats) -> Skin:
         for step in itertools.product((0, 1), repeat=3):
             cell = tuple(np.clip(index + step, 0, np.array(body.body.shape) - 1).T)
             cut |= body.unscanned[cell] & ~body.body[cell]
-    return Skin(mesh, cut, view, body.warnings)
+    return Skin(mesh, cut, view, body.warnings, broad_normals(mesh, ~cut))
 
 
 def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
@@ -159,7 +164,7 @@ class SkinPaths:
     entry_ct: Floats
     """Shape (n, 3), where the path from outside first meets the skin for good, seen from the target."""
     path_length: Floats  # shape (n,), target to entry
-    skin_angle: Floats  # shape (n,), between the path and the skin's inward normal
+    skin_angle: Floats  # shape (n,), between the path and the skin's inward normal, over some 2 cm of one from voxels
     reentry_depth: Floats  # shape (n,), where the needle would meet skin again, before where its flange waits
     unknown_depth: Floats
     """Shape (n,), where the path leaves the body through a cut, 0 where crossings of a closed skin are inconsistent."""
@@ -182,6 +187,11 @@ def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: floa
         unknown[~consistent] = 0.0
     depth[cut] = np.nan
     entry = target_ct + depth[:, None] * outward_ct
-    cosine = np.abs(np.einsum("ij,ij->i", smooth_normals(skin.mesh, face, entry), outward_ct))
+    if skin.normals is None:
+        normals = smooth_normals(skin.mesh, face, entry)
+    else:
+        corners = skin.mesh.faces[face]
+        normals = blended_normals(skin.mesh.vertices[corners], skin.normals[corners], entry)
+    cosine = np.abs(np.einsum("ij,ij->i", normals, outward_ct))
     angle = np.where(np.isnan(depth), np.nan, np.arccos(np.minimum(cosine, 1)))
     return SkinPaths(entry, depth, angle, reentry, unknown)

@@ -40,6 +40,8 @@ ENDS = ("last", "area_mm2", "thick", "wide")
 READERS = "puncture_twin.planning.case.named_files"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
+UNIT = 1.0 + 1e-12
+"""No part of a unit vector is larger, but for rounding."""
 LARGEST, MASK_BYTES = 4, 3
 """Voxels are held in memory where they take one of so many parts of it at most; and bytes of a voxel for what is found
 in a CT: the body, and what was not measured."""
@@ -244,7 +246,8 @@ def _of_skin(skin: Skin) -> Arrays:
     view = skin.field_of_view
     box = {} if view is None else {"T_ct_box": view.T_ct_box, "size_mm": view.size_mm, "cut": view.cut}
     warnings = np.array(skin.warnings, dtype=np.str_)
-    return {**mesh_arrays(skin.mesh), **box, "cut_faces": skin.cut_faces, "warnings": warnings}
+    normals = {} if skin.normals is None else {"normals": skin.normals}
+    return {**mesh_arrays(skin.mesh), **box, **normals, "cut_faces": skin.cut_faces, "warnings": warnings}
 
 
 def _to_skin(stored: Arrays) -> Skin:
@@ -252,7 +255,10 @@ def _to_skin(stored: Arrays) -> Skin:
     mesh, cut_faces = cached_mesh(stored), stored["cut_faces"]
     if cut_faces.shape != (len(mesh.faces),):
         raise ValueError("one flag for each triangle")
-    return Skin(mesh, cut_faces, view, tuple(str(warning) for warning in stored["warnings"]))
+    normals = stored.get("normals")
+    if normals is not None and (normals.shape != mesh.vertices.shape or not np.abs(normals).max(initial=0.0) <= UNIT):
+        raise ValueError("one unit normal for each vertex")
+    return Skin(mesh, cut_faces, view, tuple(str(warning) for warning in stored["warnings"]), normals)
 
 
 def cached_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:

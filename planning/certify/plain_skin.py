@@ -36,7 +36,8 @@ class PlainSkin:
         self.corners = skin.mesh.triangles - target_ct
         self.cut = skin.cut_faces
         self.closed = skin.mesh.closed
-        self._normals = _vertex_normals(skin.mesh)[skin.mesh.faces]
+        normals = _vertex_normals(skin.mesh) if skin.normals is None else skin.normals
+        self._normals = normals[skin.mesh.faces]
         self._folds = _folds(skin.mesh, self.corners)
 
     def odd(self) -> bool:

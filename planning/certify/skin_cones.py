@@ -41,8 +41,10 @@ def skin_surface(skin: Skin, target_ct: Floats) -> SkinSurface:
     mesh, rays = skin.mesh, np.random.default_rng(SEED).normal(size=(RAYS, 3))
     # one of some random rays may hit an edge: what most of them say counts
     odd = not mesh.closed or 2 * sum(bool(_crosses_odd(corners, ray)) for ray in rays) > RAYS
-    normals = np.zeros((len(mesh.vertices), 3))  # weighted by area
-    _add_normals(mesh.vertices, mesh.faces, normals)
+    normals = skin.normals
+    if normals is None:
+        normals = np.zeros((len(mesh.vertices), 3))  # weighted by area
+        _add_normals(mesh.vertices, mesh.faces, normals)
     faces = welded(mesh.vertices)[mesh.faces]
     fold = np.empty(faces.shape, bool)
     _mark_folds(faces, _side(corners), len(mesh.vertices), fold)

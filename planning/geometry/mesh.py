@@ -300,6 +300,15 @@ def _normals(mesh: TriangleMesh) -> NDArray[np.float64]:
     return np.asarray(areas / np.where(lengths > 0, lengths, 1.0))
 
 
+def blended_normals(corners: Floats, normals: Floats, points: Floats) -> Floats:
+    """Unit normals at points (n, 3) of triangles, from those at their corners; all corners (n, 3, 3); shape (n, 3)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    across = np.cross(b - a, c - a)
+    parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
+    weights = np.stack([np.einsum("ij,ij->i", part, across) for part in parts], axis=1)  # as the areas opposite
+    return unit_vectors(np.einsum("ij,ijk->ik", weights, normals))
+
+
 def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
     """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3).
 
@@ -320,19 +329,15 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
     for axis, part in enumerate(areas.T):
         at_vertex[:, axis] = about_vertices(part)
     kept, whole = np.linalg.norm(at_vertex, axis=1), about_vertices(np.linalg.norm(areas, axis=1))
-    crossed = TriangleMesh(mesh.vertices, mesh.faces[face])
-    a, b, c = np.moveaxis(crossed.triangles, 1, 0)
-    own, across = _normals(crossed), np.cross(b - a, c - a)
-    parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
-    weights = np.stack([np.einsum("ij,ij->i", part, across) for part in parts], axis=1)  # as the areas opposite
-    corner = number[mesh.faces[face]]
-    normals = _unit(at_vertex)[corner]
+    crossed, corner = TriangleMesh(mesh.vertices, mesh.faces[face]), number[mesh.faces[face]]
+    own, normals = _normals(crossed), unit_vectors(at_vertex)[corner]
     signs = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
-    blended = _unit(np.einsum("ij,ij,ijk->ik", weights, signs, normals))
+    blended = blended_normals(crossed.triangles, signs[:, :, None] * normals, points)
     coherent = (kept >= COHERENT * whole)[corner].all(axis=1)
     return np.where(coherent[:, None], blended, own)
 
 
-def _unit(vectors: Floats) -> Floats:
+def unit_vectors(vectors: Floats) -> Floats:
+    """Vectors (n, 3) of length 1; those of none stay 0."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
