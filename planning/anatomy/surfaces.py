@@ -283,8 +283,9 @@ def _to_present(stored: Arrays, fewest: int = 1, most: float = np.inf) -> Presen
     whole = labels.ndim == 1 and labels.dtype == np.int64 and fewest <= len(labels) <= most
     if not whole or not 0.0 <= rounded_by <= ROUNDED_BY:
         raise ValueError("no list of labels")
-    ends = LabelEnds(stored["last"], stored["flat_mm2"])
-    if any(one.shape != (len(labels), 3, 2) for one in ends) or [one.dtype.kind for one in ends] != ["i", "f"]:
+    ends = LabelEnds(*(stored[name] for name in LabelEnds._fields))
+    shapes = [one.shape for one in ends] == [(len(labels), 3, 2)] * 2 + [(len(labels),)]
+    if not shapes or [one.dtype.kind for one in ends] != ["i", "f", "b"]:
         raise ValueError("no ends of its labels")
     return Present(tuple(labels.tolist()), rounded_by, ends)
 

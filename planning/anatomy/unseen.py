@@ -51,16 +51,17 @@ TANGENTS = 32
 VOXELS_OF_SLACK, CELL_MM = 1.0, 2.0
 """A map may end so many voxels inside the skin's box: the skin itself is found to that. And the least edge of the cells
 by which the body beyond a map is found; it is widened by one cell to all sides."""
-FEWEST_FLAT, ORGAN_MM2 = 2, 2000.0
-"""So many labels that end flat in one plane, with nothing beyond, were cut there, or one with so large an end that does
-not end flat on the other side too, as a block does: of the real abdomen's labels none ends by itself flat over more
-than 800 mm2, and no two in one outermost plane."""
+CUT_MM, ALSO_CUT_MM = 20.0, 4.0
+"""Labels were cut off in a plane where flat ends, together so wide, lie with nothing beyond: of labels drawn
+from the real maps fewer than 1 side of 100 ends so by itself. And where they are so wide at the other sides of a map
+that was cut at one: what was cropped has as a rule several faces."""
 ENDS = (
     "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
 )
+ENDS_GRID = "; a label map of a larger part of the body would show it"
 ENDS_FLAT = (
-    "; its grid goes on, but its labels were cut off there, as it seems (flat ends in one plane: {flat}; if they end "
-    'so by themselves, a label of what lies beyond, in the same map, says so, or of a phantom region = "phantom")'
+    "; its grid goes on, but its labels were cut off there, as it seems (flat ends in one plane, {flat:.0f} mm wide "
+    "together; if they end so by themselves, a label of what lies beyond, in the same map, says so)"
 )
 
 
@@ -232,7 +233,7 @@ def beyond_labels(
         target = apply(np.linalg.inv(voxels.T_ct_index), case.target_ct[None])[0]
         if np.any((target < faces[0]) | (target > faces[1])):
             what = f"label map {grid.name} does not contain the target, so its surroundings are unknown"
-            what += ENDS_FLAT.format(flat=flat.max()) if voxels.contains(case.target_ct) else ""
+            what += ENDS_FLAT.format(flat=flat.max()) if flat.any() and voxels.contains(case.target_ct) else ""
             refuse(what, case.path, "label maps that contain the target", "labels_end")
         sections = [one for one in case.structures if one.source == grid.name]
         named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
@@ -243,7 +244,7 @@ def beyond_labels(
         if gaps.max() <= VOXELS_OF_SLACK:
             continue
         said = ENDS.format(name=grid.name, voxels=gaps.max())
-        said += ENDS_FLAT.format(flat=flat[gaps > 0.0].max()) if flat[gaps > 0.0].any() else ""
+        said += ENDS_FLAT.format(flat=flat[gaps > 0.0].max()) if flat[gaps > 0.0].any() else ENDS_GRID
         if not skin.mesh.closed:
             allowed = "a label map of the whole body about the target, or a closed skin"
             refuse(f"{said} (the skin is open)", case.path, allowed, "labels_end")
@@ -262,64 +263,67 @@ def beyond_labels(
 
 def _shown(
     case: Case, grid: LabelGrid, grids: Sequence[LabelGrid], ends: Mapping[str, LabelEnds]
-) -> tuple[Floats, Ints]:
-    """Low and high face, voxels, of what a map shows, and how many labels were cut off there; shapes (2, 3).
+) -> tuple[Floats, Floats]:
+    """Low and high face, voxels, of what a map shows, and how wide labels were cut off there, mm; shapes (2, 3).
 
     Where none was, it is the grid's face. A label beyond, in the same map, says that the others end there by
     themselves; and the rods of a phantom do.
     """
     faces = np.array([np.zeros(3), grid.voxels.shape]) - 0.5
+    alike = [one for one in grids if one is not grid and on_one_grid(one.voxels, grid.voxels)]
     own, *others = (
-        LabelEnds(*map(np.concatenate, zip(*(ends[name] for name in one.files), strict=True)))
-        for one in (grid, *(other for other in grids if other is not grid))
-        if one is grid or on_one_grid(one.voxels, grid.voxels)
+        LabelEnds(*map(np.concatenate, zip(*(ends[name] for name in one.files), strict=True))) for one in (grid, *alike)
     )
     if case.region == "phantom" or not len(own.last):
-        return faces, np.zeros((2, 3), int)
-    planes, flat = cut_off(own, grid.voxels.shape, [one for one in others if len(one.last)])
-    return np.where(flat, planes, faces), flat
+        return faces, np.zeros((2, 3))
+    planes, flat_mm = cut_off(own, grid.voxels.shape, [one for one in others if len(one.last)])
+    return np.where(flat_mm, planes, faces), flat_mm
 
 
-def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = ()) -> tuple[Floats, Ints]:
-    """The planes behind which no label of a map lies, voxels, and how many labels were cut off there; shapes (2, 3).
+def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = ()) -> tuple[Floats, Floats]:
+    """The planes behind which no label of a map lies, voxels, and how wide labels were cut off there, mm: (2, 3) each.
 
     None at the faces of the grid, of this shape, where the map ends anyhow.
     ``others`` are the other maps on its grid, none empty. One whose labels end in the same plane was cut with it: of
-    several maps with a label each no one shows a cut by itself. Then more labels must end flat in the plane than maps
-    go on beyond it: of many organs two may well end in one slice. What was cropped has as a rule several faces: at the
-    others of a map of which two labels were cut at one, one flat end is enough.
+    several maps with a label each no one shows a cut by itself. Then the ends must be wider by as much as maps go on
+    beyond the plane: of many organs two may well end in one slice.
     """
-    plane, count, weight = _outermost(own)
-    pooled, pooled_weight, beyond = count.copy(), weight.copy(), np.zeros((2, 3), int)
+    plane = _outermost(own)
+    alone, beyond = _flat_mm(own, plane), np.zeros((2, 3), int)
+    pooled = alone.copy()
     for other in others:
-        alike = (other.last[:, None] == own.last) & (other.flat_mm2[:, None] == own.flat_mm2)
+        alike = (other.last[:, None] == own.last) & (other.flat_mm[:, None] == own.flat_mm)
         twice = alike.all(axis=(2, 3)).any(axis=1)  # an organ that is in both maps is one
         if twice.all():
             continue
-        ends, more, more_weight = _outermost(other.only(~twice))
-        pooled += np.where(ends == plane, more, 0)
-        pooled_weight += np.where(ends == plane, more_weight, 0)
+        rest = other.only(~twice)
+        ends = _outermost(rest)
+        pooled += np.where(ends == plane, _flat_mm(rest, plane), 0.0)
         beyond += (ends - plane) * [[-1], [1]] > 0
     within = plane != np.array([np.zeros(3), shape]) - [[0], [1]]
-    cut = within & ((weight >= FEWEST_FLAT) | ((pooled_weight >= FEWEST_FLAT) & (pooled_weight > beyond)))
-    cut |= within & (cut & (pooled >= FEWEST_FLAT)).any() & (count > 0)
-    return plane + [[-0.5], [0.5]], np.where(cut, pooled, 0)
+    cut = within & ((_evidence(alone) >= CUT_MM) | (_evidence(pooled) >= CUT_MM * np.maximum(1, beyond)))
+    cut |= within & cut.any() & (alone.sum(axis=0) >= ALSO_CUT_MM)
+    return plane + [[-0.5], [0.5]], np.where(cut, pooled.sum(axis=0), 0.0)
 
 
-def _outermost(ends: LabelEnds) -> tuple[Ints, Ints, Ints]:
-    """A map's outermost slices; how many of its labels end flat there, and as how many they count: shapes (2, 3).
+def _outermost(ends: LabelEnds) -> Ints:
+    """A map's first and last slice with a label, shape (2, 3)."""
+    return np.stack([ends.last.min(axis=0)[:, 0], ends.last.max(axis=0)[:, 1]])
 
-    A label that ends flat on both sides along two axes is a block, drawn so, or an organ that fills a crop: it counts
-    where another label ends flat in its plane.
+
+def _flat_mm(ends: LabelEnds, plane: Ints) -> Floats:
+    """How wide labels end flat in each plane, those that are no blocks and blocks, shape (2, 2, 3)."""
+    flat_mm = np.where(ends.last == plane.T, ends.flat_mm, 0.0)
+    return np.stack([flat_mm[of].sum(axis=0).T for of in (~ends.block, ends.block)])
+
+
+def _evidence(flat_mm: Floats) -> Floats:
+    """How much of flat ends, (2, 2, 3), says that they were cut, (2, 3).
+
+    A block was drawn so, or is an organ that fills a crop: it counts where other labels end flat with it.
     """
-    plane = np.stack([ends.last.min(axis=0)[:, 0], ends.last.max(axis=0)[:, 1]])
-    block = (np.count_nonzero(ends.flat_mm2.all(axis=2), axis=1) >= 2)[:, None, None]
-    flat_mm2 = np.where(ends.last == plane.T, ends.flat_mm2, 0.0)
-    count = np.count_nonzero(flat_mm2, axis=0).T
-    flat_mm2 = np.where(block & ~((flat_mm2 > 0.0) & ~block).any(axis=0), 0.0, flat_mm2)
-    alone = (flat_mm2 >= ORGAN_MM2) & (ends.flat_mm2[:, :, ::-1] == 0.0)
-    weight = np.where(alone, FEWEST_FLAT, flat_mm2 > 0.0).sum(axis=0).T
-    return plane, count, weight
+    labels, blocks = flat_mm
+    return labels + np.minimum(blocks, CUT_MM - ALSO_CUT_MM)
 
 
 def _near_body(case: Case, skin: TriangleMesh, voxels: VolumeGrid, margin_mm: float, memory: Memory) -> Floats:

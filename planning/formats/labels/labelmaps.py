@@ -27,7 +27,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 from skimage.measure import marching_cubes
 
-from puncture_twin.planning.base.arrays import Bools
+from puncture_twin.planning.base.arrays import Bools, Ints
 from puncture_twin.planning.base.errors import refuse, refusing
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.base.strict_json import parse_json
@@ -46,10 +46,10 @@ ROUNDED_BY = 0.02
 """How far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
 LEAST_WHOLE = 0.15
 """Fraction of voxels besides the background: a blended map is whole inside its labels, an image in 4 % by chance."""
-FLAT, NEAR_MM, SPECK_MM2 = 0.5, 6.0, 100.0
-"""A label ends flat where its outermost slice is so much of its largest slice so near, and is no speck. Near: a cut
-that takes but the tip of a round organ leaves an end that is small beside the organ's middle. Not nearer than a coarse
-map's steps are, where it was resampled to finer slices."""
+NEAR_MM, STEADY = 6.0, 0.95
+"""How flat a label ends is seen by its outermost slice beside its largest one so near. Near: a cut that takes but the
+tip of a round organ leaves an end that is small beside the organ's middle. Not nearer than a coarse map's steps are,
+where it was resampled to finer slices. And a block's slices have so much of the largest one there, or more."""
 Box = tuple[slice, slice, slice]
 
 
@@ -57,11 +57,12 @@ class LabelEnds(NamedTuple):
     """Where each of n labels ends along each axis of its file, at the low and the high end."""
 
     last: NDArray[np.int64]  # shape (n, 3, 2), its first and last slice
-    flat_mm2: NDArray[np.float64]  # shape (n, 3, 2), the area of that slice where the label ends flat, else 0
+    flat_mm: NDArray[np.float64]  # shape (n, 3, 2), how wide and flat each end is: small where it tapers
+    block: Bools  # shape (n,), whether it has the same section near both ends along two axes, as what somebody drew
 
-    def only(self, selected: Bools) -> "LabelEnds":
-        """Those of some labels, given by a mask (n,)."""
-        return LabelEnds(self.last[selected], self.flat_mm2[selected])
+    def only(self, selected: Bools | Ints) -> "LabelEnds":
+        """Those of some labels, given by a mask (n,) or by their places."""
+        return LabelEnds(self.last[selected], self.flat_mm[selected], self.block[selected])
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,17 +93,20 @@ class LabelMap:
 
 
 def label_ends(labelmap: LabelMap) -> LabelEnds:
-    """Where the labels present end, and where flat: as what was cut does; organs end round."""
+    """Where the labels present end, and how flat: as what was cut does; organs end round.
+
+    The width of an end is the root of its slice's area; it counts by the cube of that slice's part of the largest near.
+    """
     spacing_mm, boxes = np.linalg.norm(labelmap.T_ct_index[:3, :3], axis=0), labelmap.boxes
     last = np.array([[[at.start, at.stop - 1] for at in box] for box in boxes.values()], np.int64).reshape(-1, 3, 2)
-    flat_mm2 = np.zeros(last.shape)
-    for (label, box), of_label in zip(boxes.items(), flat_mm2, strict=True):
+    flat_mm, steady = np.zeros(last.shape), np.zeros(last.shape, bool)
+    for n, (label, box) in enumerate(boxes.items()):
         for axis, counts in enumerate(slice_counts(labelmap.labels[box] == label)):
             near = 1 + max(1, round(NEAR_MM / spacing_mm[axis]))
-            areas_mm2 = counts * np.prod(np.delete(spacing_mm, axis))
-            inward = areas_mm2[:near], areas_mm2[::-1][:near]
-            of_label[axis] = [one[0] if one[0] >= max(SPECK_MM2, FLAT * one.max()) else 0.0 for one in inward]
-    return LabelEnds(last, flat_mm2)
+            area_mm2, inward = np.prod(np.delete(spacing_mm, axis)), (counts[:near], counts[::-1][:near])
+            flat_mm[n, axis] = [np.sqrt(one[0] * area_mm2) * (one[0] / one.max()) ** 3 for one in inward]
+            steady[n, axis] = [one.min() >= STEADY * one.max() for one in inward]
+    return LabelEnds(last, flat_mm, np.count_nonzero(steady.all(axis=2), axis=1) >= 2)
 
 
 def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
