@@ -77,6 +77,8 @@ class LabelGrid:
     name: str
     files: frozenset[str]
     voxels: VolumeGrid
+    cut: tuple[str, ...] | None = None
+    """The sides of the patient at which its labels were cut off before the grid's face, where the case states them."""
 
     def own(self, structures: Sequence[Structure]) -> list[Structure]:
         """The structures that come from it."""
@@ -89,6 +91,13 @@ def label_grids(case: Case) -> tuple[LabelGrid, ...]:
     sources = {name: [name] for name in maps if name is not None}
     sets = [one.mask_set for one in case.structures if one.mask_set is not None]
     sources |= {one: list(case.masks(one).values()) for one in sets}
+    stated = [(many.source, many.cut) for many in case.structures]
+    stated += [(one.labelmap or "", one.cut) for one in case.structure if one.role != "skin"]
+    cuts = {
+        of: tuple({side for name, sides in stated if name == of for side in sides or ()})
+        for of in {name for name, sides in stated if sides is not None}
+    }
     return tuple(
-        LabelGrid(name, frozenset(files), case.volumes.source(files[0]).grid) for name, files in sorted(sources.items())
+        LabelGrid(name, frozenset(files), case.volumes.source(files[0]).grid, cuts.get(name))
+        for name, files in sorted(sources.items())
     )

@@ -11,17 +11,18 @@ organs end round. Other maps on the grid may have been cropped there too, or not
 each such face becomes a closed surface of role ``unknown``; the air beyond it, outside of the skin, does not.
 """
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from puncture_twin.planning.anatomy.body.cut_ends import SIDES, FieldOfView
+from puncture_twin.planning.anatomy.body.cut_ends import SIDES, FieldOfView, stated_ends
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import LabelGrid, Role, Structure, label_grids
-from puncture_twin.planning.base.arrays import Floats, Ints, widened
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, widened
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
@@ -61,8 +62,9 @@ ENDS = (
 ENDS_GRID = "; a label map of a larger part of the body would show it"
 ENDS_FLAT = (
     "; its grid goes on, but its labels were cut off there, as it seems (flat ends in one plane, {flat:.0f} mm wide "
-    "together; if they end so by themselves, a label of what lies beyond, in the same map, says so)"
+    "together; if they end so by themselves, cut = [] beside the map in the case says so)"
 )
+STATED = "label map {name}: cut = {cut} is stated, so flat ends of labels within its grid say nothing"
 
 
 class Assumed(NamedTuple):
@@ -235,6 +237,8 @@ def beyond_labels(
             what = f"label map {grid.name} does not contain the target, so its surroundings are unknown"
             what += ENDS_FLAT.format(flat=flat.max()) if flat.any() and voxels.contains(case.target_ct) else ""
             refuse(what, case.path, "label maps that contain the target", "labels_end")
+        if grid.cut is not None:
+            warnings.append(STATED.format(name=grid.name, cut=json.dumps(sorted(grid.cut))))
         sections = [one for one in case.structures if one.source == grid.name]
         named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
         margin = max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])
@@ -267,17 +271,28 @@ def _shown(
     """Low and high face, voxels, of what a map shows, and how wide labels were cut off there, mm; shapes (2, 3).
 
     Where none was, it is the grid's face. A label beyond, in the same map, says that the others end there by
-    themselves; and the rods of a phantom do.
+    themselves; so do the case, and the rods of a phantom.
     """
     faces = np.array([np.zeros(3), grid.voxels.shape]) - 0.5
-    alike = [one for one in grids if one is not grid and on_one_grid(one.voxels, grid.voxels)]
+    alike = [one for one in grids if one is not grid and one.cut != () and on_one_grid(one.voxels, grid.voxels)]
     own, *others = (
         LabelEnds(*map(np.concatenate, zip(*(ends[name] for name in one.files), strict=True))) for one in (grid, *alike)
     )
-    if case.region == "phantom" or not len(own.last):
+    if grid.cut and len(own.last):
+        return np.where(stated_cuts(grid), _outermost(own) + [[-0.5], [0.5]], faces), np.zeros((2, 3))
+    if case.region == "phantom" or grid.cut is not None or not len(own.last):
         return faces, np.zeros((2, 3))
     planes, flat_mm = cut_off(own, grid.voxels.shape, [one for one in others if len(one.last)])
     return np.where(flat_mm, planes, faces), flat_mm
+
+
+def stated_cuts(grid: LabelGrid) -> Bools:
+    """At which low and high faces of a map's own axes the case states that it was cut, shape (2, 3)."""
+    voxels = grid.voxels
+    T_ct_oriented = canonical(np.broadcast_to(np.uint8(0), voxels.shape), voxels.T_ct_index).T_ct_index
+    turned = np.rint(np.linalg.inv(voxels.T_ct_index) @ T_ct_oriented)[:3, :3]  # each axis by the patient's: 0, 1, -1
+    sides = stated_ends(grid.cut or ())[np.abs(turned).argmax(axis=1)]
+    return np.where(turned.sum(axis=1)[:, None] > 0.0, sides, sides[:, ::-1]).T
 
 
 def cut_off(own: LabelEnds, shape: Sequence[int], others: Sequence[LabelEnds] = ()) -> tuple[Floats, Floats]:

@@ -95,6 +95,7 @@ Stated = Literal["none", "present"]
 Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
 Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
 Margins = Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)]
+Sides = tuple[Literal["right", "left", "front", "back", "feet", "head"], ...]
 AIR_HU, DENSE_HU = -900.0, 250.0
 """Air is -1000; its noise in a mean over 3 mm is some 15, so that 100 is more than six times that. Foam of a mattress
 has -970 to -900: what is less dense than this is not told from air. Cancellous bone starts at about 200; soft tissue
@@ -114,7 +115,7 @@ class StructureSection(Section):
     labelmap: str | None = None
     label: Label | None = None
     ct: str | None = None
-    cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] | None = None
+    cut: Sides | None = None
     hu: Annotated[Number, Field(ge=-1024, le=30_000)] | None = None
 
     def _problems(self) -> Iterator[SchemaError]:
@@ -132,8 +133,9 @@ class StructureSection(Section):
             yield SchemaError(what, "key_not_of_it")
         if self.ct is not None and self.role != "skin":
             yield SchemaError(f"'{self.name}': ct gives only the body's skin; role must be \"skin\"", "key_not_of_it")
-        if self.cut is not None and self.role != "skin":
-            yield SchemaError(f"'{self.name}': cut is for the skin: it states where the body was cut", "key_not_of_it")
+        if self.cut is not None and self.role != "skin" and self.labelmap is None:
+            what = f"'{self.name}': cut is for the skin and for label maps: it states where they were cut"
+            yield SchemaError(what, "key_not_of_it")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
             yield SchemaError(f'\'{self.name}\': margin_mm is for role "avoid", not "{self.role}"', "key_not_of_it")
 
@@ -152,6 +154,7 @@ class StructuresSection(Section):
     unknown: Margins = Field(default_factory=dict)
     traverse: Patterns = ()
     ignore: Patterns = ()
+    cut: Sides | None = None
 
     def _problems(self) -> Iterator[SchemaError]:
         sources = [key for key in ("labelmap", "masks", "seg", "rtstruct") if getattr(self, key) is not None]

@@ -99,6 +99,7 @@ BAD = {
     "no source": (('mesh = "organ.stl"\nunit = "mm"', ""), "not_one_source"),
     "label map without a label": (('mesh = "organ.stl"\nunit = "mm"', 'labelmap = "seg.nii"'), "keys_together"),
     "mesh without a unit": (('mesh = "organ.stl"\nunit = "mm"', 'mesh = "organ.stl"'), "unit_not_stated"),
+    "cut of an organ's mesh": (('role = "target"', 'role = "target"\ncut = []'), "key_not_of_it cut"),
     "margin on the wrong role": (('role = "target"', 'role = "target"\nmargin_mm = 3'), "key_not_of_it margin_mm"),
     "missing file": (('mesh = "organ.stl"', 'mesh = "gone.stl"'), "no_such_file organ gone.stl"),
     "a name with a path": (('name = "one"', 'name = "../one"'), "bad_name"),

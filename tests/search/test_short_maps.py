@@ -1,5 +1,6 @@
 """A label map that ends in the body: what lies beyond is unknown, never free; compared along the map's own axes."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,11 @@ from places import DATA, REAL_CT
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.anatomy.unseen import CUT_MM, cut_off
+from puncture_twin.planning.anatomy.structure import LabelGrid
+from puncture_twin.planning.anatomy.unseen import CUT_MM, cut_off, stated_cuts
 from puncture_twin.planning.formats.labels.labelmaps import LabelEnds, LabelMap, label_ends, labelmap_of
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.search.context import prepare
 
@@ -306,6 +309,40 @@ def test_a_target_where_the_labels_were_blanked_is_refused(tmp_path):
     labels[:, :, :60] = 0
     with refused("labels_end", "flat ends in one plane"):
         prepare(organ_case(tmp_path / "blanked", labels), arm=False)
+
+
+@pytest.mark.parametrize(
+    ("cut", "beyond"), [("[]", []), ('["left"]', [[82, 0, 0]]), ('["right", "head"]', [[-82, 0, 0], [0, 0, 82]])]
+)
+def test_the_case_states_where_a_map_was_cut(tmp_path, cut, beyond):
+    """At its left, as it seems; a person says that nothing is missing there, or where else labels were lost."""
+    labels = organs()
+    labels[:, :, 74:] = 0
+    path = organ_case(tmp_path / "blanked", labels)
+    path.write_text(path.read_text().replace("labelmap =", f"cut = {cut}\nlabelmap ="))
+    anatomy = prepare(path, arm=False).anatomy
+    sides = json.dumps(sorted(json.loads(cut)))
+    assert any(f"label map labels.nrrd: cut = {sides} is stated" in said for said in anatomy.warnings)
+    assert not any("flat ends in one plane" in said for said in anatomy.warnings)
+    solids = [one.mesh for one in anatomy.structures if one.name == "beyond_labels"]
+    assert len(solids) == bool(beyond)
+    for solid in solids:
+        for at in ([82, 0, 0], [-82, 0, 0], [0, 82, 0], [0, -82, 0], [0, 0, 82], [0, 0, -82]):
+            assert (side_of(solid, np.array(at, float)) is Side.INSIDE) == (at in beyond)
+
+
+def test_stated_sides_are_the_patients_however_a_map_is_stored():
+    """Axes permuted and flipped; nearest to the map's own where it is oblique."""
+    turn = Rotation.from_euler("xyz", (10, -15, 20), degrees=True).as_matrix()
+    for order, signs in (((0, 1, 2), (1, 1, 1)), ((2, 0, 1), (-1, 1, -1)), ((1, 0, 2), (1, -1, 1))):
+        T = np.eye(4)
+        for axis, (row, sign) in enumerate(zip(order, signs, strict=True)):
+            T[:3, axis] = 2.0 * sign * turn[:, row]
+        grid = LabelGrid("any", frozenset(), VolumeGrid((5, 6, 7), T, {}), ("left", "feet"))
+        faces = stated_cuts(grid)
+        assert faces[int(signs[order.index(0)] > 0), order.index(0)]
+        assert faces[int(signs[order.index(2)] < 0), order.index(2)]
+        assert np.count_nonzero(faces) == 2
 
 
 def test_one_label_in_two_files_is_one():
