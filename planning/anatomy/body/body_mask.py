@@ -269,6 +269,8 @@ def nearest_parts(mask: Bools, radius_mm: float, spacing_mm: Floats, most_mm: fl
     cores = parts_of(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm) > radius_mm)
     if not len(cores.sizes):
         return np.zeros(mask.shape, np.int32)
+    if len(cores.sizes) == 1 and np.isinf(most_mm):
+        return np.ones(mask.shape, np.int32)
     numbers = cores.painted(np.argsort(np.argsort(-cores.sizes, kind="stable"), kind="stable").astype(np.int32) + 1)
     gap_mm, nearest = scipy.ndimage.distance_transform_edt(numbers == 0, sampling=spacing_mm, return_indices=True)
     parts = np.where(gap_mm <= most_mm, numbers[tuple(nearest)], 0)

@@ -131,9 +131,11 @@ def _pieces(body: Bools, solid: Bools, bone: Bools, spacing_mm: Floats) -> Itera
         air[tuple(index.T)] += ~solid[tuple(at.T)]
     air /= DIRECTIONS
     partly, exposed = air >= PARTLY, air >= EXPOSED
+    if not partly.any():
+        return
     gap_mm = scipy.ndimage.distance_transform_edt(~partly, sampling=spacing_mm)
     groups, count = scipy.ndimage.label(gap_mm <= GAP_MM / 2.0, FULL)
-    for number in range(1, count + 1) if partly.any() else ():
+    for number in range(1, count + 1):
         group = partly & (groups == number)
         seen = np.argwhere(group & exposed) * spacing_mm
         large = len(seen) * block_ml >= MIN_BONE_ML and np.linalg.norm(np.ptp(seen, axis=0)) >= LEAST_MM
