@@ -395,11 +395,11 @@ mounts = ["ceiling", "side"]
 step_mm = 300.0
 [place.ceiling]
 along_mm = [-100.0, 200.0]
-across_mm = [0.0, 450.0]
+across_mm = [150.0, 450.0]
 height_mm = [450.0, 550.0]
 [place.side]
-along_mm = [-300.0, 300.0]
-across_mm = [0.0, 450.0]
+along_mm = [0.0, 300.0]
+across_mm = [150.0, 450.0]
 height_mm = [450.0, 550.0]
 """
 
@@ -408,7 +408,7 @@ height_mm = [450.0, 550.0]
 def grid(tmp_path_factory):
     here = tmp_path_factory.mktemp("grid") / "abdomen"
     shutil.copytree(folder() / "abdomen", here)
-    text = (here / "case.toml").read_text().replace("step_deg = 2.0", "step_deg = 8.0")
+    text = (here / "case.toml").read_text().replace("step_deg = 2.0", "step_deg = 10.0")
     (here / "case.toml").write_text(text + LITTLE)
     context = prepare(here, arm=False)
     return context, organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
