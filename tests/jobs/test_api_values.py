@@ -74,7 +74,7 @@ def values(given):
         "verify": pt.verify(given["certificate"], context),
         "rehearse": rehearsal,
         "place": PlaceSearch(np.eye(4), (), 0, 1.0, 1.0, 0, (0, 0), (), None),
-        "touch": pt.touch(armed),
+        "touch": pt.touch(armed, candidate=found.best),
         "camera_view": pt.camera_view(armed, plan),
         "probe_view": pt.probe_view(armed, plan),
         "compare": pt.compare(context, candidates.best, candidates.pick(0), candidates=candidates),
