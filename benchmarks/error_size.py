@@ -3,9 +3,9 @@
     python -m benchmarks.error_size
 
 The needle shifts by Student's t of nu degrees, 1 mm a deviation across it. A bore around it is touched with (1 +
-d²/nu)^(-nu/2), two plates with twice the distribution's tail; a bar along it, and errors twice as large across as
-towards it, have no closed form: ten million draws. Columns are the distance d in deviations. Where the size is known
-the error is normal, and the bore is touched with exp(-d²/2).
+d²/nu)^(-nu/2), two plates with twice the distribution's tail; a bar along it, with errors twice as large across as
+towards it, and the narrow sides of two walls have no closed form: ten million draws. Columns are the distance d in
+deviations. Where the size is known the error is normal, and the bore is touched with exp(-d²/2).
 """
 
 from __future__ import annotations
@@ -61,6 +61,16 @@ def bar(d: float) -> trimesh.Trimesh:
     return made
 
 
+WALLS = (0.4, 1.65)  # half widths, mm: less than a deviation, and just below where the small rule's lines lie
+
+
+def wall(d: float, half: float) -> trimesh.Trimesh:
+    """A wall whose narrow side faces the needle."""
+    made = trimesh.creation.box((FAR, 2 * half, HIGH))
+    made.apply_translation([d + RADIUS + FAR / 2, 0, 0])
+    return made
+
+
 def rows(freedom: int | None) -> Iterator[tuple[str, list[float], list[float]]]:
     """What is touched, the true chances and the refined ones."""
     d = np.array(DISTANCES, dtype=float)
@@ -73,6 +83,10 @@ def rows(freedom: int | None) -> Iterator[tuple[str, list[float], list[float]]]:
     x, y = size * rng.normal(size=DRAWS), size * 2 * rng.normal(size=DRAWS)
     drawn = [float(np.mean(np.hypot(x - (at + RADIUS + BAR), y) < BAR + RADIUS)) for at in d]
     yield "bar, drawn", drawn, [touched(bar(x), (1, 2), freedom) for x in d]
+    for half in WALLS:
+        aside = np.maximum(np.abs(y / 2) - half, 0.0)
+        drawn = [float(np.mean(np.hypot(np.maximum(at + RADIUS - x, 0.0), aside) < RADIUS)) for at in d]
+        yield f"wall of {2 * half:g}, drawn", drawn, [touched(wall(at, half), (1, 1), freedom) for at in d]
 
 
 def main() -> None:

@@ -123,35 +123,37 @@ def line_chance(
         return math.nan
     basis = line_basis(likeliest, uncertainty.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
     surface, flat, whole = uncertainty.surface_mm > 0.0, -slack / steep, 0.0
-    rules = [many_lines(surface, count, freedom) for count in (MANY_LINES if freedom is None else STUDENT_LINES)]
+    rules = [many_lines(surface, count, freedom) for count in MANY_LINES]
     if alone and freedom is None:
         rules.insert(0, few_lines(surface))  # exact enough only about one smooth nearest surface
     done = np.empty(0)
     for lines in rules:
         more = lines.without_first(len(done))
         chances = np.append(done, walked(problem, uncertainty.root, uncertainty.surface_mm, basis, more))
-        done = done if lines is few_lines(surface) else chances  # every spread of lines continues the one before
+        done = done if lines.few else chances  # every spread of lines continues the one before
         if freedom is not None:
             whole, chances = float(stdtr(freedom, flat)), chances - stdtr(lines.degrees, flat / lines.scales)
         mean = float(lines.weights @ chances)
         deviation = math.sqrt(float(lines.weights @ (chances - mean) ** 2))
-        if deviation <= (DISAGREE if freedom is None else agreement(len(chances), whole + mean)):
+        if deviation <= agreement(lines, whole + mean):
             break
     return min(max(whole + mean, 0.0), 1.0)
 
 
-def agreement(count: int, chance: float) -> float:
-    """Deviation up to which lines over Student's t are trusted: spread evenly, they err by a quarter of its error."""
-    return 4.0 * math.sqrt(count) * max(ERRS_BY, ERRS_BY_PART * chance)
+def agreement(lines: Lines, chance: float) -> float:
+    """Deviation of the lines' chances up to which their mean is trusted.
+
+    Many, spread evenly, err by a quarter of its error. Few lie all equally far out, and see an edge there or none: they
+    err by as much as they deviate.
+    """
+    fewer = 1.0 if lines.few else 4.0 * math.sqrt(len(lines.weights))
+    return fewer * max(ERRS_BY, ERRS_BY_PART * chance)
 
 
-MANY_LINES, STUDENT_LINES = (128, 512), (128, 256, 512)
+MANY_LINES = (128, 256, 512)
 """Where something else is touched about as soon as what is likeliest, or sizes are uncertain; where these disagree."""
 ERRS_BY, ERRS_BY_PART = 3e-4, 0.02
 """Error of a chance, and of what is that part of it, that is not worth more lines."""
-DISAGREE = 0.1
-"""Standard deviation of the lines' chances up to which few are trusted with .003: against 4,096 lines they err by that
-at most, and by .013 where it is .2 (three anatomies; next to a lung and between ribs)."""
 
 
 class Lines(NamedTuple):
@@ -162,13 +164,14 @@ class Lines(NamedTuple):
     farthest: Floats  # shape (n,), scales that it is walked to either side; an open stretch there goes on for ever
     degrees: int  # of Student's t along it; 0 of the normal
     weights: Floats  # shape (n,), their sum is 1
+    few: bool = False  # whether they are the small rule's
 
     def without_first(self, count: int) -> Lines:
         """All but the first of them."""
         offsets, scales, farthest, weights = (
             part[count:] for part in (self.offsets, self.scales, self.farthest, self.weights)
         )
-        return Lines(offsets, scales, farthest, self.degrees, weights)
+        return Lines(offsets, scales, farthest, self.degrees, weights, self.few)
 
 
 @cache
@@ -183,7 +186,7 @@ def few_lines(surface: bool) -> Lines:
     if surface:
         mixed = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
         offsets, weights = np.concatenate([offsets + mixed, offsets - mixed]), np.tile(weights, 2) / 2
-    return _normal_lines(offsets, weights)
+    return _normal_lines(offsets, weights, few=True)
 
 
 @cache
@@ -212,8 +215,8 @@ def many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
     return Lines(offsets, scales, farthest, degrees, weights / weights.sum())
 
 
-def _normal_lines(offsets: Floats, weights: Floats) -> Lines:
-    return Lines(offsets, np.ones(len(offsets)), np.full(len(offsets), FARTHEST), 0, weights)
+def _normal_lines(offsets: Floats, weights: Floats, *, few: bool = False) -> Lines:
+    return Lines(offsets, np.ones(len(offsets)), np.full(len(offsets), FARTHEST), 0, weights, few)
 
 
 def student_radius(dimensions: int, freedom: int, chance: Floats | float) -> Floats:
