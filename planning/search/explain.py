@@ -19,7 +19,7 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.bending import Insertion, Stretch, insertion_along, stretches
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, way_cells
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text, way_cells
 from puncture_twin.planning.uncertainty.guided import WayChance
 
 NEAREST = 8
@@ -316,7 +316,8 @@ def reason_text(candidates: Candidates, row: int) -> str:
         text += f": the needle crosses it{deep_text(amount)}"
         text += f"; {margin:g} mm clearance is demanded" if np.isfinite(margin) else ""
     elif np.isfinite(amount):
-        text += f" with {amount:.2f} {UNITS.get(reason, 'mm clearance')}"
+        unit = UNITS.get(reason, "mm clearance")
+        text += f" with {chance_text(amount) if unit.startswith('chance') else f'{amount:.2f}'} {unit}"
         text += f" where {margin:g} mm is demanded" if np.isfinite(margin) else ""
     if candidates.verdict.detail[row]:
         text += f" - {candidates.verdict.detail[row]}"

@@ -118,6 +118,17 @@ def test_a_needle_through_a_structure_crosses_it(case, candidates):
     )
 
 
+def test_a_small_chance_is_not_written_as_none(candidates):
+    """A rejection for a chance of .0028 said that it was 0.00."""
+    verdict = candidates.verdict
+    reasons, amounts = (
+        np.array(["touch_likely"] * len(candidates), verdict.reason.dtype),
+        np.full(len(candidates), 2.8e-3),
+    )
+    likely = replace(candidates, verdict=replace(verdict, reason=reasons, amount=amounts))
+    assert reason_text(likely, 0).split(" with ")[1].startswith("0.0028 chance to touch")
+
+
 def test_the_greys_of_what_is_not_known_are_told_apart(case, candidates):
     """In the body, beside it, and outside of the grid: a colour or lines of its own each; the legend has both."""
     found = world.make_candidates(case, beta_deg=(0, 180))
