@@ -53,7 +53,7 @@ def test_a_worker_that_dies_costs_nothing_but_time_and_twice_its_case_one_row(pl
 def test_a_case_beyond_a_limit_is_stopped(planned):
     """With its reason, and the refused one is reached."""
     out, run = planned
-    reasons = run(write_page=cohort_world.sleep_or_eat, limits=Limits(1500, 6.0)).reasons
+    reasons = run(write_page=cohort_world.sleep_or_eat, limits=Limits(1500, 10.0)).reasons
     assert (reasons["timed_out"], reasons["out_of_memory"]) == (1, 1)
     assert [code for code, _ in rows(out)] == [3, 3, 2]
 
