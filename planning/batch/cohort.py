@@ -92,6 +92,7 @@ def _refuse_unreadable(error: OSError) -> NoReturn:
 
 
 CASE, NAME, TARGET = "case", "name", "target"
+LONGEST_CELL = 20_000
 ALLOWED_COLUMNS = f"{CASE}, {NAME}, {TARGET}, and options as KIND.KEY (KIND one of {', '.join(SECTIONS)})"
 
 
@@ -102,6 +103,8 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
     cases = []
     for line, row in lines:
         where = f"{path}: line {line}"
+        if max(map(len, row)) > LONGEST_CELL:
+            refuse("is not a CSV file", where, f"text, cells of at most {LONGEST_CELL} characters", "not_csv")
         if len(row) != len(header):
             refuse(f"{len(row)} cells", where, f"{len(header)}, as in the header", "ragged_row")
         cases.append(_case(dict(zip(header, row, strict=True)), path, where))

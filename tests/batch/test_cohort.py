@@ -85,6 +85,7 @@ def test_a_target_is_a_point_or_a_name(tmp_path, cell, option):
         ("case,name\n,b\n", "bad_name"),
         ("case\na\0b\n", "bad_name"),
         ('case\na"b\n"c\n', "not_csv"),
+        ("case\n" + "a" * 30_000, "not_csv"),
         ("\n,\ncase\ra\rb,c\r", "ragged_row line 5"),
         ("case,needle.length_mm\na,nan\n", "bad_value"),
     ],
