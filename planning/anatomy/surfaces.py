@@ -40,8 +40,8 @@ ENDS = ("last", "area_mm2", "thick", "wide")
 READERS = "puncture_twin.planning.case.named_files"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
-UNIT = 1.0 + 1e-12
-"""No part of a unit vector is larger, but for rounding."""
+ROUNDING = 1e-12
+"""By so much a unit vector's length may be off 1."""
 LARGEST, MASK_BYTES = 4, 3
 """Voxels are held in memory where they take one of so many parts of it at most; and bytes of a voxel for what is found
 in a CT: the body, and what was not measured."""
@@ -256,8 +256,10 @@ def _to_skin(stored: Arrays) -> Skin:
     if cut_faces.shape != (len(mesh.faces),):
         raise ValueError("one flag for each triangle")
     normals = stored.get("normals")
-    if normals is not None and (normals.shape != mesh.vertices.shape or not np.abs(normals).max(initial=0.0) <= UNIT):
-        raise ValueError("one unit normal for each vertex")
+    if normals is not None and (normals.dtype != np.float64 or normals.shape != mesh.vertices.shape):
+        raise ValueError("one normal for each vertex")
+    if normals is not None and not np.abs(np.linalg.norm(normals, axis=1) - 1.0).max(initial=0.0) <= ROUNDING:
+        raise ValueError("normals of length 1")
     return Skin(mesh, cut_faces, view, tuple(str(warning) for warning in stored["warnings"]), normals)
 
 
