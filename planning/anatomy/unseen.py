@@ -53,9 +53,9 @@ VOXELS_OF_SLACK, CELL_MM = 1.0, 2.0
 """A map may end so many voxels inside the skin's box: the skin itself is found to that. And the least edge of the cells
 by which the body beyond a map is found; it is widened by one cell to all sides."""
 CUT_MM, ALSO_CUT_MM = 20.0, 4.0
-"""Labels were cut off in a plane where flat ends, together so wide, lie with nothing beyond: of labels drawn
-from the real maps fewer than 1 side of 100 ends so by itself. And where they are so wide at the other sides of a map
-that was cut at one: what was cropped has as a rule several faces."""
+"""Labels were cut off in a plane where flat ends, together so wide, lie with nothing beyond: labels of organs seldom
+end so by themselves. And where they are so wide at the other sides of a map that was cut at one: what was cropped has
+as a rule several faces."""
 ENDS = (
     "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
 )
